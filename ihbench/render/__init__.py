@@ -1,0 +1,1 @@
+"""Drawing: the mesh z-buffer (`zbuffer`) and the Gaussian splat renderer (`splat`)."""

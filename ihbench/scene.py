@@ -1,0 +1,149 @@
+"""The common currency: what a loader yields, what a method is given, what it gives back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench.camera import Camera
+
+if TYPE_CHECKING:
+    from ihbench.body import Body
+    from ihbench.ledger import Ledger
+    from ihbench.progress import Progress
+
+
+@dataclass(frozen=True)
+class BodyPose:
+    """SMPL parameters of one frame, standard root convention: rotate about joint 0, then translate."""
+
+    pose: NDArray[np.float64]  # [24, 3] rad, axis-angle, root first
+    betas: NDArray[np.float64]  # [B] shape coefficients
+    transl: NDArray[np.float64]  # [3] m
+
+    def __post_init__(self) -> None:
+        for name, value in (("pose", self.pose), ("betas", self.betas), ("transl", self.transl)):
+            value = np.array(value, dtype=np.float64)
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+        if self.pose.shape != (24, 3) or self.betas.ndim != 1 or self.transl.shape != (3,):
+            raise ValueError(
+                f"body pose: expected pose [24, 3], betas [B], transl [3], "
+                f"got {self.pose.shape}, {self.betas.shape}, {self.transl.shape}"
+            )
+
+
+class MaskState(IntEnum):
+    """What a training pixel is known to show. The complete silhouette is not among it: that would leak the answer."""
+
+    BACKGROUND = 0  # known to show no person
+    PERSON = 1  # visible person
+    UNKNOWN = 2  # behind the occluder: person or background, nobody knows
+
+
+@dataclass(frozen=True)
+class TrainView:
+    """One training image as a method may see it: undistorted, hidden pixels painted with the background colour."""
+
+    image: NDArray[np.uint8]  # [H, W, 3] RGB
+    mask: NDArray[np.uint8]  # [H, W] MaskState
+    camera: Camera
+    body_pose: BodyPose
+    frame: int  # frame number in the capture
+    camera_id: str
+
+
+@dataclass(frozen=True)
+class TestView:
+    """One test image with its truth. Methods never see it; only camera and body pose reach `Avatar.render`."""
+
+    __test__ = False  # pytest: not a test class
+
+    image: NDArray[np.float32]  # [H, W, 3] RGB in [0, 1], un-occluded, on the protocol's background
+    silhouette: NDArray[np.bool_]  # [H, W] the true, complete silhouette
+    camera: Camera
+    body_pose: BodyPose
+    frame: int
+    camera_id: str
+
+
+@dataclass(frozen=True)
+class TrainingSet:
+    """Everything `Method.fit` gets. `views` loads lazily; index it as often as you like."""
+
+    views: Sequence[TrainView]
+    body: Body
+    background: tuple[float, float, float]  # RGB in [0, 1]
+    name: str  # the scene's name, for messages only
+
+
+class Capture(Protocol):
+    """One subject of a data set, opened lazily: headers at once, pixels when asked.
+
+    Images and silhouettes are as stored: original size, lens distortion in. Frames and cameras are the data set's
+    own indices, from 0. `BadInput` names the file when something is missing, truncated or mis-shaped.
+    """
+
+    name: str  # the subject, e.g. "377"
+    dataset: str  # registered name of the format, e.g. "zju_mocap"
+    variant: str  # which of the layouts this copy is, e.g. "original/new_params"
+    standin: str  # "" for real data, else what made it, e.g. "stand-in v1 seed 0"
+    body: str  # "smpl", or "procedural" for the bench's own body
+    n_frames: int
+    camera_ids: tuple[str, ...]
+
+    def camera(self, camera: int) -> Camera: ...
+
+    def body_pose(self, frame: int) -> BodyPose: ...
+
+    def image(self, camera: int, frame: int) -> NDArray[np.uint8]:
+        """[H, W, 3] RGB."""
+        ...
+
+    def silhouette(self, camera: int, frame: int, source: str = "mask") -> NDArray[np.bool_]:
+        """[H, W]. `source` is a data-set specific choice of mask files; a protocol names it."""
+        ...
+
+
+class Dataset(Protocol):
+    """A folder of captures in one on-disk format. The constructor checks the layout and raises `BadInput`."""
+
+    root: Path
+
+    def __init__(self, root: Path): ...
+
+    def subjects(self) -> list[str]: ...
+
+    def open(self, subject: str) -> Capture: ...
+
+
+class Avatar(Protocol):
+    """A fitted person that can be drawn in any pose from any camera."""
+
+    def render(
+        self, camera: Camera, body_pose: BodyPose, background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """rgb [H, W, 3] in [0, 1] composited on `background`, and alpha [H, W] in [0, 1]."""
+        ...
+
+    def save(self, folder: Path) -> None: ...
+
+
+class Method(Protocol):
+    """A system under test. `config` is a frozen dataclass; its fields become `--method.*` switches."""
+
+    config: Any
+
+    def __init__(self, config: Any): ...
+
+    def fit(
+        self, training: TrainingSet, *, device: str, seed: int, ledger: Ledger, progress: Progress
+    ) -> Avatar: ...
+
+    def load(self, folder: Path, body: Body, device: str = "cpu") -> Avatar: ...
