@@ -1,0 +1,1 @@
+"""Methods: one folder per system, each with a card and its code."""

@@ -1,0 +1,1 @@
+"""Protocols: one TOML file each, and the occlusion rules they name."""

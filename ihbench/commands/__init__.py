@@ -1,0 +1,1 @@
+"""One module per command: its options as a frozen dataclass, and `main(argv) -> exit status`."""

@@ -1,0 +1,141 @@
+"""The body's surface as an image: texels, position maps, chart padding, sampling.
+
+Texture coordinates follow OBJ files (u right, v up, origin bottom left); maps have row 0 at the top. Texel (row i,
+column j) of an R x R map has its centre at u = (j + 0.5) / R, v = 1 - (i + 0.5) / R.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench.render.zbuffer import rasterize
+
+if TYPE_CHECKING:
+    from ihbench.body.model import Body
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Texels:
+    """The N texels of an R x R map whose centres lie on the surface, in row-major order."""
+
+    resolution: int  # R
+    index: NDArray[np.int64]  # [N] row * R + column
+    face: NDArray[np.int32]  # [N] the face each centre lies in
+    bary: Array  # [N, 3] where in it
+    uv: Array  # [N, 2] texel centres
+
+    @property
+    def mask(self) -> NDArray[np.bool_]:
+        """[R, R] True at the texels in this table."""
+        out = np.zeros(self.resolution**2, bool)
+        out[self.index] = True
+        return out.reshape(self.resolution, self.resolution)
+
+    def interpolate(
+        self,
+        per_vertex: NDArray,  # [V, C]
+        faces: NDArray[np.integer],  # [F, 3] Body.faces
+    ) -> NDArray[np.float64]:
+        """[N, C] values at the texels from values at the vertices."""
+        return np.einsum("nk,nkc->nc", self.bary, per_vertex[faces[self.face]])
+
+
+@lru_cache(maxsize=32)
+def texel_table(body: Body, resolution: int) -> Texels:
+    """The texels of a body's texture map; cached for each body object and resolution."""
+    corners = map_coordinates(body.uv, resolution) + 0.5
+    flat = np.column_stack([corners, np.ones(len(corners))])
+    raster = rasterize(flat, body.uv_faces, resolution, resolution)
+    index = np.flatnonzero(raster.face.ravel() >= 0)
+    face = raster.face.ravel()[index]
+    row, column = np.divmod(index, resolution)
+    uv = np.column_stack([(column + 0.5) / resolution, 1 - (row + 0.5) / resolution])
+    texels = Texels(resolution, index, face, _barycentric(uv, body.uv[body.uv_faces[face]]), uv)
+    for array in (texels.index, texels.face, texels.bary, texels.uv):
+        array.setflags(write=False)
+    return texels
+
+
+def _barycentric(points: Array, triangles: Array) -> Array:
+    """[N, 3] of points [N, 2] in triangles [N, 3, 2]: in double precision, where the z-buffer keeps single."""
+    a = triangles[:, 0]
+    e1, e2, p = triangles[:, 1] - a, triangles[:, 2] - a, points - a
+    area = e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]
+    w1 = (p[:, 0] * e2[:, 1] - p[:, 1] * e2[:, 0]) / area
+    w2 = (e1[:, 0] * p[:, 1] - e1[:, 1] * p[:, 0]) / area
+    return np.column_stack([1 - w1 - w2, w1, w2])
+
+
+def map_coordinates(
+    uv: Array,  # [..., 2]
+    resolution: int,
+) -> Array:
+    """[..., 2] column and row of a map, counted so that integers are texel centres."""
+    column = uv[..., 0] * resolution - 0.5
+    row = (1 - uv[..., 1]) * resolution - 0.5
+    return np.stack([column, row], -1)
+
+
+def grid_sample_coordinates(uv: Any) -> Any:
+    """[..., 2] uv -> the `grid` of torch's grid_sample that samples a map where `sample_uv` does.
+
+    Works on numpy arrays and torch tensors. Pass `align_corners=False, padding_mode="border"`.
+    """
+    grid = 2 * uv - 1
+    grid[..., 1] = -grid[..., 1]
+    return grid
+
+
+def sample_uv(
+    values: NDArray,  # [R, R, C]
+    uv: Array,  # [N, 2]
+) -> NDArray[np.float64]:
+    """[N, C] bilinear samples of a map; outside the outermost texel centres the edge value holds."""
+    resolution = values.shape[0]
+    position = np.clip(map_coordinates(np.asarray(uv, np.float64), resolution), 0, resolution - 1)
+    low = np.minimum(position.astype(np.int64), max(resolution - 2, 0))
+    high = np.minimum(low + 1, resolution - 1)
+    (x, y), (x0, y0), (x1, y1) = (position - low).T[..., None], low.T, high.T
+    top = values[y0, x0] * (1 - x) + values[y0, x1] * x
+    bottom = values[y1, x0] * (1 - x) + values[y1, x1] * x
+    return top * (1 - y) + bottom * y
+
+
+def position_map(
+    vertices: Array,  # [V, 3] m
+    body: Body,
+    resolution: int,
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Where each texel of the surface is: [R, R, 3] m, 0 off the charts, and the mask [R, R] of texels on them."""
+    texels = texel_table(body, resolution)
+    out = np.zeros((resolution**2, 3), np.float32)
+    out[texels.index] = texels.interpolate(vertices, body.faces)
+    return out.reshape(resolution, resolution, 3), texels.mask
+
+
+def chart_padding(
+    mask: NDArray[np.bool_],  # [R, R] texels on a chart
+    texels: int,
+) -> NDArray[np.int64]:
+    """[R, R] for every texel the flat index of the texel to copy from: itself on a chart, the nearest chart texel
+    within `texels` rows and columns of one, -1 farther out.
+
+    `padded = np.where(index[..., None] >= 0, flat[index], fill)` widens the charts, so that bilinear samples at their
+    borders do not mix with the background.
+    """
+    from scipy.ndimage import distance_transform_cdt, distance_transform_edt
+
+    index = np.full(mask.shape, -1, np.int64)
+    if not mask.any():
+        return index
+    near = distance_transform_cdt(~mask, metric="chessboard") <= texels
+    row, column = distance_transform_edt(~mask, return_distances=False, return_indices=True)
+    index[near] = (row * mask.shape[1] + column)[near]
+    return index

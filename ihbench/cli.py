@@ -1,0 +1,72 @@
+"""The command line. Commands are looked up by name and imported only when called, so `--help` stays fast."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from importlib import import_module
+
+from ihbench import __version__
+from ihbench.errors import BadInput
+
+COMMANDS = {
+    "run": "fit a method under a protocol, score it, print the table (the main job)",
+    "list": "what is registered: methods, datasets, protocols, reports, metrics",
+    "protocol": "show every choice of a protocol, or where two differ",
+    "plan": "what a run would do, what it leaves out and why; runs nothing",
+    "data": "check a data folder, or write a stand-in capture",
+    "report": "tables of finished runs",
+    "export": "an avatar's Gaussians as a splat PLY",
+    "kernels": "error against milliseconds for the bench's own kernels",
+}
+
+
+def usage() -> str:
+    lines = [
+        f"ihbench {__version__}: how well does a method rebuild an occluded person as an animatable 3D avatar?",
+        "",
+        "usage: ihbench COMMAND [options]        ihbench COMMAND --help shows its options",
+        "",
+    ]
+    lines += [f"  {name:<10}{what}" for name, what in COMMANDS.items()]
+    lines += [
+        "",
+        "start here: ihbench run --protocol zju_occ --scene standin-1",
+        "exit status: 0 done, 1 a check failed or a run diverged, 2 bad input or a missing prerequisite",
+    ]
+    return "\n".join(lines)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one command and return its exit status."""
+    argv = sys.argv[1:] if argv is None else argv
+    if not argv or argv[0] in ("-h", "--help", "help"):
+        print(usage())
+        return 0
+    if argv[0] in ("-V", "--version"):
+        print(__version__)
+        return 0
+    as_json = "--json" in argv
+    try:
+        if argv[0] not in COMMANDS:
+            from ihbench.registry import nearest
+
+            raise BadInput(f"unknown command {argv[0]!r}: {nearest(argv[0], list(COMMANDS))}")
+        return import_module(f"ihbench.commands.{argv[0]}").main(argv[1:])
+    except BadInput as error:
+        print(f"ihbench: {error}", file=sys.stderr)
+        if as_json:
+            print(json.dumps({"status": "bad input", "error": str(error)}))
+        return 2
+    except KeyboardInterrupt:
+        print("ihbench: interrupted; the same command continues where it stopped", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        # the reader of our output went away (`ihbench list | head`): not an error of ours
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,72 @@
+"""`ihbench protocol show P` and `ihbench protocol diff A B`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
+
+from ihbench.commands.parse import options
+from ihbench.protocol import difference, flatten, load_protocol
+
+
+@dataclass(frozen=True)
+class Show:
+    """Every choice of one protocol."""
+
+    protocol: Annotated[str, tyro.conf.Positional]
+    """Name of the protocol."""
+    profile: str = "paper"
+    """Profile under which to show it."""
+    json: bool = False
+    """Print one JSON object on stdout."""
+
+
+@dataclass(frozen=True)
+class Diff:
+    """Where two protocols differ, key by key."""
+
+    a: Annotated[str, tyro.conf.Positional]
+    b: Annotated[str, tyro.conf.Positional]
+    profile: str = "paper"
+    """Profile under which to compare them."""
+    json: bool = False
+    """Print one JSON object on stdout."""
+
+
+Command = (
+    Annotated[Show, tyro.conf.subcommand("show", description=Show.__doc__)]
+    | Annotated[Diff, tyro.conf.subcommand("diff", description=Diff.__doc__)]
+)
+
+
+def main(argv: list[str]) -> int:
+    chosen = options(Command, argv, "protocol", "Look at protocols.")  # type: ignore[arg-type]
+    return _show(chosen) if isinstance(chosen, Show) else _diff(chosen)
+
+
+def _show(chosen: Show) -> int:
+    protocol = load_protocol(chosen.protocol, chosen.profile)
+    if chosen.json:
+        print(json.dumps({**protocol.content, "profile": protocol.profile, "digest": protocol.digest}, ensure_ascii=False))
+        return 0
+    pairs = [*flatten(protocol.content), ("profile", f'"{protocol.profile}"'), ("digest", f'"{protocol.digest}"')]
+    width = max(len(key) for key, _ in pairs)
+    for key, value in pairs:
+        print(f"{key:<{width}}  {value}")
+    return 0
+
+
+def _diff(chosen: Diff) -> int:
+    a, b = load_protocol(chosen.a, chosen.profile), load_protocol(chosen.b, chosen.profile)
+    rows = difference(a, b)
+    if chosen.json:
+        print(json.dumps([{"key": k, chosen.a: x, chosen.b: y} for k, x, y in rows], ensure_ascii=False))
+        return 0
+    for key, left, right in rows:
+        print(key)
+        print(f"  {a.name:<24}{left or '(not set)'}")
+        print(f"  {b.name:<24}{right or '(not set)'}")
+    return 0

@@ -1,0 +1,94 @@
+"""A contact sheet per run: occluded input, truth, prediction and error side by side, to be looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+COLUMNS = ("training input", "truth", "prediction", "error ×4")
+PAD, LABEL = 6, 18  # px
+GREY = 70
+
+
+@dataclass(frozen=True)
+class SheetRow:
+    label: str
+    training: NDArray[np.uint8]  # [H, W, 3] an occluded training image of about the same moment
+    truth: NDArray[np.float32]  # [H, W, 3] in [0, 1]
+    prediction: NDArray[np.float32]  # [H, W, 3] in [0, 1]
+
+
+def error_image(prediction: NDArray[np.float32], truth: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Mean absolute error over the channels, times four: black is right, white is wrong by a quarter or more."""
+    error = np.abs(prediction - truth).mean(-1, keepdims=True) * 4
+    return np.repeat(_to_8bit(error), 3, -1)
+
+
+def contact_sheet(rows: Sequence[SheetRow], title: str) -> NDArray[np.uint8]:
+    """[H, W, 3] one row of four images per view, cut to the person, under a title line and column heads."""
+    from PIL import Image, ImageDraw
+
+    cells = []
+    for row in rows:
+        images = (row.training, _to_8bit(row.truth), _to_8bit(row.prediction), error_image(row.prediction, row.truth))
+        window = _window(row)
+        cells.append([images[0][_window_of(row.training)]] + [image[window] for image in images[1:]])
+    height = max(cell.shape[0] for line in cells for cell in line)
+    width = max(cell.shape[1] for line in cells for cell in line)
+    width = max(width, 110)
+    sheet = Image.new(
+        "RGB",
+        (len(COLUMNS) * (width + PAD) + PAD, 2 * LABEL + len(cells) * (height + LABEL + PAD) + PAD),
+        (GREY, GREY, GREY),
+    )
+    draw = ImageDraw.Draw(sheet)
+    draw.text((PAD, 3), title, fill=(255, 255, 255))
+    for c, name in enumerate(COLUMNS):
+        draw.text((PAD + c * (width + PAD), LABEL + 2), name, fill=(210, 210, 210))
+    for r, (row, line) in enumerate(zip(rows, cells, strict=True)):
+        y = 2 * LABEL + r * (height + LABEL + PAD)
+        draw.text((PAD, y + 2), row.label, fill=(210, 210, 210))
+        for c, cell in enumerate(line):
+            x = PAD + c * (width + PAD) + (width - cell.shape[1]) // 2
+            sheet.paste(Image.fromarray(np.ascontiguousarray(cell)), (x, y + LABEL))
+    return np.asarray(sheet)
+
+
+def write_png(path: Path, image: NDArray[np.uint8]) -> None:
+    """Write an RGB image atomically. Raises `BadInput` when the disk does not take it."""
+    import io
+
+    from PIL import Image
+
+    from ihbench.atomic import write_bytes
+
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "PNG")
+    write_bytes(path, buffer.getvalue())
+
+
+def _to_8bit(image: NDArray[np.float32]) -> NDArray[np.uint8]:
+    return np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
+
+
+def _window(row: SheetRow) -> tuple[slice, slice]:
+    truth, prediction = _window_of(_to_8bit(row.truth)), _window_of(_to_8bit(row.prediction))
+    return tuple(  # type: ignore[return-value]
+        slice(min(a.start, b.start), max(a.stop, b.stop)) for a, b in zip(truth, prediction, strict=True)
+    )
+
+
+def _window_of(image: NDArray[np.uint8], margin: int = 4) -> tuple[slice, slice]:
+    """The part of an image that differs from its corner's colour."""
+    differs = (np.abs(image.astype(int) - image[0, 0].astype(int)) > 8).any(-1)
+    if not differs.any():
+        return slice(0, image.shape[0]), slice(0, image.shape[1])
+    rows, cols = np.flatnonzero(differs.any(1)), np.flatnonzero(differs.any(0))
+    return (
+        slice(max(rows[0] - margin, 0), min(rows[-1] + margin + 1, image.shape[0])),
+        slice(max(cols[0] - margin, 0), min(cols[-1] + margin + 1, image.shape[1])),
+    )

@@ -1,0 +1,94 @@
+"""What a time was measured on: machine identity, peak memory, and waiting for the device before reading a clock.
+
+torch is looked at only if something else has imported it already.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+from pathlib import Path
+from typing import Any
+
+
+def identity() -> dict[str, Any]:
+    """Processor, cores, memory, Python, torch and load: what somebody needs to judge a time in seconds.
+
+    Host names and user names are left out: run folders are shared.
+    """
+    torch = sys.modules.get("torch")
+    facts: dict[str, Any] = {
+        "cpu": cpu_model(),
+        "cores": os.cpu_count() or 1,
+        "cores_usable": usable_cores(),
+        "memory_gb": memory_gb(),
+        "platform": platform.platform(),
+        "python": platform.python_version(),
+        "torch": str(torch.__version__) if torch is not None else None,
+        "torch_threads": torch.get_num_threads() if torch is not None else None,
+        "gpu": torch.cuda.get_device_name() if _cuda_in_use() else None,
+        "load_average": [round(value, 2) for value in os.getloadavg()] if hasattr(os, "getloadavg") else None,
+    }
+    return facts
+
+
+def cpu_model() -> str:
+    """The processor's name, as the system tells it."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+def usable_cores() -> int:
+    """Cores this process may run on; fewer than the machine has under taskset or a batch system."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def memory_gb() -> float | None:
+    """GiB of main memory."""
+    try:
+        return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
+    except (ValueError, OSError, AttributeError):
+        return None
+
+
+def peak_memory_mb() -> float:
+    """MiB, the most main memory this process has held so far."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return float("nan")
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 2**20 if sys.platform == "darwin" else peak / 2**10
+
+
+def peak_device_memory_mb() -> float:
+    """MiB, the most GPU memory torch has held so far; 0 without a GPU in use."""
+    if not _cuda_in_use():
+        return 0.0
+    return sys.modules["torch"].cuda.max_memory_allocated() / 2**20
+
+
+def synchronize(device: str = "cpu") -> None:
+    """Wait until the device has done what was asked of it, so that a clock read next tells the truth."""
+    torch = sys.modules.get("torch")
+    kind = str(device).partition(":")[0]
+    if torch is None or kind == "cpu":
+        return
+    if kind == "cuda" and torch.cuda.is_available():
+        torch.cuda.synchronize(device)
+    elif kind == "mps" and torch.backends.mps.is_available():
+        torch.mps.synchronize()
+
+
+def _cuda_in_use() -> bool:
+    """Whether this process has opened a GPU. Asking must not open one."""
+    torch = sys.modules.get("torch")
+    return torch is not None and torch.cuda.is_available() and torch.cuda.is_initialized()

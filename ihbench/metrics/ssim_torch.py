@@ -1,0 +1,64 @@
+"""The SSIM of `ssim.py` for training losses: same definition, differentiable, on any device."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ihbench.metrics.ssim import K1, K2, check_window, gaussian_window
+
+
+def ssim_map_torch(
+    pred: Tensor,  # [..., C, H, W] in [0, data_range]
+    truth: Tensor,  # [..., C, H, W]
+    *,
+    window: int = 11,
+    sigma: float = 1.5,
+    data_range: float = 1.0,
+) -> Tensor:
+    """[..., C, H, W] SSIM at every pixel, differentiable in both images.
+
+    Half precision is raised to float32; float64 stays. In float32 a variance may come out up to 1e-7 below zero on a
+    flat patch, against C2 = 9e-4: no division comes near zero, and gradients stay finite. Raises `ValueError` for
+    shapes that do not match.
+    """
+    if pred.shape != truth.shape or pred.ndim < 3:
+        raise ValueError(
+            f"images: expected two of the same shape [..., C, H, W], got {tuple(pred.shape)}, {tuple(truth.shape)}"
+        )
+    check_window(window, sigma)
+    dtype = torch.promote_types(torch.promote_types(pred.dtype, truth.dtype), torch.float32)
+    height, width = pred.shape[-2:]
+    x, y = (image.to(dtype).reshape(-1, 1, height, width) for image in (pred, truth))
+    weights = torch.from_numpy(gaussian_window(window, sigma)).to(pred.device, dtype)
+    s, d = x + y, x - y
+    mean_s, mean_d, square_s, square_d = _blurred(torch.cat([s, d, s * s, d * d], 1), weights).unbind(1)
+    mean_s, mean_d = mean_s * mean_s, mean_d * mean_d
+    luminance = _ratio(mean_s, mean_d, 2 * (K1 * data_range) ** 2)
+    contrast = _ratio(square_s - mean_s, square_d - mean_d, 2 * (K2 * data_range) ** 2)
+    return (luminance * contrast).reshape(pred.shape)
+
+
+def _ratio(a: Tensor, b: Tensor, c: float) -> Tensor:
+    return (a - b + c) / (a + b + c)
+
+
+def _blurred(images: Tensor, weights: Tensor) -> Tensor:
+    """[N, M, H, W] filtered along both axes, mirrored at the edges."""
+    count, maps, height, width = images.shape
+    radius = len(weights) // 2
+    out = images.reshape(-1, 1, height, width)
+    out = F.conv2d(_mirrored(out, -2, radius), weights.view(1, 1, -1, 1))
+    out = F.conv2d(_mirrored(out, -1, radius), weights.view(1, 1, 1, -1))
+    return out.reshape(count, maps, height, width)
+
+
+def _mirrored(images: Tensor, dim: int, radius: int) -> Tensor:
+    """Padded by `radius` on both sides, d c b a | a b c d. `F.pad` knows only the form that skips the edge pixel."""
+    while radius > 0:  # an image smaller than the window is mirrored more than once
+        step = min(radius, images.shape[dim])
+        head, tail = images.narrow(dim, 0, step), images.narrow(dim, images.shape[dim] - step, step)
+        images = torch.cat([head.flip(dim), images, tail.flip(dim)], dim)
+        radius -= step
+    return images

@@ -1,0 +1,140 @@
+"""What a scene needs, measured from masks, cameras and body poses alone, before anything is fitted.
+
+Nothing here imports torch or cv2: `ihbench plan` answers fast.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench.camera import Camera
+from ihbench.occlusion import Occlusion, apply_rule
+from ihbench.protocol import Protocol
+from ihbench.scene import BodyPose, Capture, MaskState
+from ihbench.visibility import Visibility, texel_visibility
+
+if TYPE_CHECKING:
+    from ihbench.body import Body
+
+MEASURE_SIZE = 256  # px; visibility is measured on images reduced to about this
+MEASURE_VIEWS = 50  # at most this many training views, evenly spaced
+TEXELS = 128  # side of the UV grid on which visibility is measured
+
+
+@dataclass(frozen=True)
+class Omission:
+    """Something left out of a run. `field` is a config field of the method, or a region of the protocol."""
+
+    field: str
+    value: Any
+    reason: str
+
+
+@dataclass(frozen=True)
+class SceneMeasure:
+    """What was measured of a scene under a protocol."""
+
+    training_views: int
+    covered_views: int
+    test_views: int
+    hidden_share: float  # of the pooled person pixels in covered frames
+    visible_texels: float  # shares of the body's texels
+    hidden_texels: float
+    never_seen_texels: float
+    motion_deg: float  # largest range of any joint's rotation over the training frames, root apart
+    turn_deg: float  # range of the root's heading over the training frames
+    pixel_mm: float  # body millimetres per pixel of the protocol's image, median over views
+    surface_mm: float  # side of a square of the body's area, mm: texel_mm(R) follows from it
+    occlusion: dict[str, Any]
+
+    def texel_mm(self, resolution: int) -> float:
+        """Mean side of one texel of a UV map of this resolution on the body, mm."""
+        return self.surface_mm / resolution
+
+
+@dataclass(frozen=True)
+class _MaskView:
+    mask: NDArray[np.uint8]
+    camera: Camera
+    body_pose: BodyPose
+
+
+def measure_scene(capture: Capture, protocol: Protocol, body: Body) -> SceneMeasure:
+    """Measure one capture under a protocol. Reads masks of at most `MEASURE_VIEWS` training views, no images."""
+    from ihbench.body.uv import texel_table
+
+    occlusion, frames, covered = apply_rule(protocol, capture)
+    chosen = np.unique(np.linspace(0, len(frames) - 1, min(MEASURE_VIEWS, len(frames))).round().astype(int))
+    views = [_mask_view(capture, protocol, occlusion, frames[k], covered[k]) for k in chosen]
+    person = hidden = 0
+    for k in chosen:
+        if covered[k]:
+            silhouette = capture.silhouette(protocol.train_camera, frames[k], protocol.silhouette)
+            person += int(silhouette.sum())
+            hidden += int(silhouette[:, occlusion.columns].sum())
+    texels = texel_table(body, TEXELS)
+    seen = texel_visibility(views, body, texels)
+    poses = np.stack([capture.body_pose(frame).pose for frame in frames])
+    first = views[0]
+    vertices = body.pose(first.body_pose)
+    depth = float(first.camera.to_camera(vertices)[:, 2].mean())
+    focal = float(np.sqrt(first.camera.K[0, 0] * first.camera.K[1, 1])) * protocol.image.size / first.camera.width
+    corners = vertices[body.faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
+    filled = len(texels.face) / TEXELS**2
+    return SceneMeasure(
+        training_views=len(frames),
+        covered_views=sum(covered),
+        test_views=len(protocol.testing_cameras(len(capture.camera_ids)))
+        * len(protocol.testing_frames(capture.name, capture.n_frames)),
+        hidden_share=hidden / person if person else 0.0,
+        visible_texels=_share(seen, "visible"),
+        hidden_texels=_share(seen, "hidden"),
+        never_seen_texels=_share(seen, "never_seen"),
+        motion_deg=float(np.rad2deg(np.ptp(poses[:, 1:], axis=0).max())),
+        turn_deg=_turn(poses[:, 0]),
+        pixel_mm=1000 * depth / focal,
+        surface_mm=1000 * float(np.sqrt(area / filled)),
+        occlusion={"rule": occlusion.rule, **occlusion.record},
+    )
+
+
+def absent_regions(measure: SceneMeasure, regions: tuple[str, ...]) -> list[Omission]:
+    """Regions of the protocol that hold nothing in this scene."""
+    shares = {"hidden": measure.hidden_texels, "never_seen": measure.never_seen_texels}
+    reasons = {
+        "hidden": "every texel that faced the training camera was also seen un-occluded",
+        "never_seen": "every texel faced the training camera at least once",
+    }
+    return [Omission(r, None, reasons[r]) for r in regions if r in shares and shares[r] == 0]
+
+
+def _share(seen: Visibility, what: str) -> float:
+    return float(getattr(seen, what).mean())
+
+
+def _mask_view(capture: Capture, protocol: Protocol, occlusion: Occlusion, frame: int, covered: bool) -> _MaskView:
+    silhouette = capture.silhouette(protocol.train_camera, frame, protocol.silhouette)
+    state = np.where(silhouette, MaskState.PERSON, MaskState.BACKGROUND).astype(np.uint8)
+    if covered:
+        state[occlusion.hidden(len(state))] = MaskState.UNKNOWN
+    camera = capture.camera(protocol.train_camera)
+    step = max(1, camera.width // MEASURE_SIZE)
+    state = np.ascontiguousarray(state[step // 2 :: step, step // 2 :: step])
+    return _MaskView(state, camera.scaled(state.shape[1], state.shape[0]), capture.body_pose(frame))
+
+
+def _turn(roots: NDArray[np.float64]) -> float:  # [F, 3] rad
+    """Degrees between the extreme headings of the body's front, unwrapped over the frames."""
+    from scipy.spatial.transform import Rotation
+
+    front = Rotation.from_rotvec(roots).apply([0.0, 0.0, 1.0])
+    # the two world axes in which the front moves most span the ground plane, whichever axis is up
+    _, _, axes = np.linalg.svd(front - front.mean(0), full_matrices=False)
+    plane = front @ axes[:2].T
+    centred = np.unwrap(np.arctan2(plane[:, 1], plane[:, 0]))
+    return float(np.rad2deg(np.ptp(centred)))

@@ -1,0 +1,90 @@
+"""Regions of a test view: where a number is taken.
+
+`visible`, `hidden` and `never_seen` partition `body` by what training showed of the surface that a pixel shows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench.camera import Camera
+from ihbench.render.zbuffer import rasterize
+from ihbench.scene import TestView
+from ihbench.visibility import Visibility
+
+if TYPE_CHECKING:
+    from ihbench.body import Body
+    from ihbench.body.uv import Texels
+
+VISIBLE, HIDDEN, NEVER_SEEN = 1, 2, 3
+
+
+@dataclass(frozen=True)
+class SurfaceMap:
+    """What training showed of the surface, as an image over UV space (charts padded outwards)."""
+
+    body: Body
+    labels: NDArray[np.uint8]  # [R, R] VISIBLE, HIDDEN or NEVER_SEEN
+
+    @classmethod
+    def build(cls, body: Body, texels: Texels, visibility: Visibility) -> SurfaceMap:
+        from ihbench.body.uv import chart_padding
+
+        size = texels.resolution
+        flat = np.zeros(size * size, np.uint8)
+        flat[texels.index] = np.select([visibility.visible, visibility.hidden], [VISIBLE, HIDDEN], NEVER_SEEN)
+        return cls(body, flat[chart_padding(texels.mask, size)])
+
+    def regions(self, view: TestView, names: tuple[str, ...], box_padding: float) -> dict[str, NDArray[np.bool_] | str]:
+        """Masks [H, W] of the named regions; a string instead of a mask says why a region is absent."""
+        vertices = self.body.pose(view.body_pose)
+        surface = self._surface_labels(vertices, view)
+        every = {
+            "full": lambda: np.ones_like(view.silhouette),
+            "box": lambda: projected_box(vertices, view.camera, box_padding),
+            "body": lambda: view.silhouette,
+            "visible": lambda: surface == VISIBLE,
+            "hidden": lambda: surface == HIDDEN,
+            "never_seen": lambda: surface == NEVER_SEEN,
+        }
+        return {name: every[name]() for name in names}
+
+    def _surface_labels(self, vertices: NDArray[np.float64], view: TestView) -> NDArray[np.uint8]:
+        """[H, W] label of every silhouette pixel, 0 elsewhere. Garments stand off the body, so silhouette pixels
+        beyond the projected body take the label of the nearest body pixel."""
+        from scipy.ndimage import distance_transform_edt
+
+        camera, size = view.camera, len(self.labels)
+        raster = rasterize(camera.project(vertices), self.body.faces, camera.height, camera.width)
+        labels = np.zeros((camera.height, camera.width), np.uint8)
+        hit = raster.mask
+        if not hit.any():
+            return np.where(view.silhouette, NEVER_SEEN, 0).astype(np.uint8)
+        uv = raster.interpolate(self.body.uv, self.body.uv_faces)[hit]
+        col = np.clip((uv[:, 0] * size).astype(int), 0, size - 1)
+        row = np.clip(((1 - uv[:, 1]) * size).astype(int), 0, size - 1)
+        labels[hit] = self.labels[row, col]
+        rows, cols = distance_transform_edt(~hit, return_distances=False, return_indices=True)
+        return np.where(view.silhouette, labels[rows, cols], 0).astype(np.uint8)
+
+
+def projected_box(vertices: NDArray[np.float64], camera: Camera, padding: float) -> NDArray[np.bool_]:
+    """[H, W] the convex outline of the body's axis-aligned world box, padded by `padding` m on every side.
+
+    NeuralBody calls it mask_at_box (zju3dv/neuralbody lib/utils/if_nerf/if_nerf_data_utils.py).
+    """
+    import cv2
+
+    low, high = vertices.min(0) - padding, vertices.max(0) + padding
+    corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+    p = camera.project(corners)
+    if (p[:, 2] <= 0).any():  # the box reaches behind the camera: its outline has no bounded projection
+        return np.ones((camera.height, camera.width), bool)
+    hull = cv2.convexHull(np.round(p[:, :2] - 0.5).astype(np.int32))
+    mask = np.zeros((camera.height, camera.width), np.uint8)
+    cv2.fillConvexPoly(mask, hull, 1)
+    return mask.astype(bool)

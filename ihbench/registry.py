@@ -1,0 +1,69 @@
+"""Finding registered things (methods, data sets, protocols, …) by name, without importing them until asked.
+
+Everything is a Python entry point, so a third-party package registers its own the same way this one does.
+"""
+
+from __future__ import annotations
+
+from difflib import get_close_matches
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from ihbench.errors import BadInput
+
+GROUPS = {
+    "method": "ihbench.methods",
+    "config": "ihbench.configs",
+    "dataset": "ihbench.datasets",
+    "stand-in": "ihbench.standins",
+    "protocol": "ihbench.protocols",
+    "occlusion": "ihbench.occlusions",
+    "report": "ihbench.reports",
+}
+
+
+@cache
+def _found(kind: str) -> dict[str, EntryPoint]:
+    return {point.name: point for point in sorted(entry_points(group=GROUPS[kind]), key=lambda p: p.name)}
+
+
+def names(kind: str) -> list[str]:
+    """Registered names of a kind, sorted."""
+    return list(_found(kind))
+
+
+def nearest(name: str, known: list[str]) -> str:
+    """The end of an unknown-name message: "did you mean 'x'? known: x, y"."""
+    close = get_close_matches(name, known, n=1, cutoff=0.4)
+    hint = f"did you mean {close[0]!r}? " if close else ""
+    return f"{hint}known: {', '.join(known) or 'none'}"
+
+
+def entry_point(kind: str, name: str) -> EntryPoint:
+    """The entry point itself. Raises `BadInput` with the nearest known name."""
+    found = _found(kind)
+    if name not in found:
+        raise BadInput(f"unknown {kind} {name!r}: {nearest(name, list(found))}")
+    return found[name]
+
+
+def load(kind: str, name: str) -> Any:
+    """Import and return the registered object. Raises `BadInput` for an unknown name or a missing package."""
+    point = entry_point(kind, name)
+    try:
+        return point.load()
+    except ImportError as error:
+        raise BadInput(f"{kind} {name!r} cannot be loaded: {error}") from error
+
+
+def package_folder(kind: str, name: str) -> Path:
+    """The folder of the package that registers a name, found without importing the registered module itself."""
+    module = entry_point(kind, name).module
+    for candidate in (module, module.rpartition(".")[0]):
+        spec = find_spec(candidate) if candidate else None
+        if spec and spec.submodule_search_locations:
+            return Path(next(iter(spec.submodule_search_locations)))
+    raise BadInput(f"{kind} {name!r}: its package {module!r} cannot be found")

@@ -1,0 +1,144 @@
+"""Isotropic Gaussian splatting: one function, three back ends that agree (float64 torch, numba on the CPU, gsplat on CUDA).
+
+The Gaussians are the paper's: a centre, one scale, a colour, opacity 1. What every back end draws is defined here:
+
+- Projection: `p = R x + t`; depth `z = p_z`; centre `u = K p / z` with pixel centres at +0.5; footprint variance
+  `(f s / z)^2 + LOW_PASS` px² with `f = sqrt(fx fy)`.
+- At distance d px from its centre a splat has alpha `min(ALPHA_MAX, exp(-d² / (2 variance)))`; below `ALPHA_MIN` it is
+  dropped. The constants are those of 3D Gaussian splatting (Kerbl et al. 2023, released code) as `gsplat` has them.
+- Splats are composited front to back in the order of their depth, compared as float32; equal depths keep the order of
+  their index. What is left of the transmittance shows the background.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ihbench.camera import Camera
+
+NEAR = 0.01  # m; a Gaussian whose centre is no farther than this from the camera plane is not drawn
+LOW_PASS = 0.3  # px²; added to every footprint, so that a splat smaller than a pixel cannot fall between the centres
+ALPHA_MAX = 0.999  # an opaque splat still lets 1/1000 through: the transmittance never reaches 0 in one step
+ALPHA_MIN = 1 / 255  # an alpha below one grey level is dropped, which ends the footprint at 3.33 sigma
+BACKENDS = ("auto", "reference", "numba", "gsplat")
+
+
+@dataclass(frozen=True)
+class Splats:
+    """Gaussians projected to one image: what a back end composites. Float64 apart from the colours and the depth."""
+
+    xy: Tensor  # [M, 2] px
+    variance: Tensor  # [M] px², low-pass included
+    depth: Tensor  # [M] m, float32, without gradient: it only orders
+    colors: Tensor  # [M, C]
+
+
+def render_gaussians(
+    means: Tensor,  # [N, 3] m, world
+    scales: Tensor,  # [N] m, standard deviation
+    colors: Tensor,  # [N, C]
+    camera: Camera,
+    background: Sequence[float] | Tensor = (1.0, 1.0, 1.0),  # [C], or [1] for all channels
+    backend: str = "auto",
+) -> tuple[Tensor, Tensor]:
+    """Draw opaque isotropic Gaussians -> rgb [H, W, C], alpha [H, W], in the dtype and on the device of `means`.
+
+    Differentiable in `means`, `scales` and `colors`; under `torch.no_grad()` nothing is kept for a backward pass. The
+    background is a constant: no gradient flows to it. `scales` enter squared.
+
+    `backend`: "reference" is the float64 twin (slow, any device), "numba" the CPU, "gsplat" CUDA (the `cuda` extra),
+    "auto" gsplat for CUDA tensors and numba otherwise (the reference where numba is not installed).
+
+    A Gaussian with a value that is NaN or infinite, or that leaves float32 when projected, is not drawn and gets a zero
+    gradient: one bad Gaussian must not blacken the picture, and whoever trains checks the parameters for finiteness.
+
+    Raises ValueError for a camera with lens distortion (undistort the image, use `camera.undistorted()`), for wrong
+    shapes and for an unknown back end; ImportError or RuntimeError where the asked-for back end cannot run here.
+    """
+    background = _check(means, scales, colors, camera, background)
+    backend = _choose_backend(backend, means.device)
+    splats = project_gaussians(means, scales, colors, camera)
+    if backend == "numba":
+        from ihbench.render.splat_numba import composite
+    elif backend == "gsplat":
+        from ihbench.render.splat_gsplat import composite
+    else:
+        from ihbench.render.splat_reference import composite
+    rgb, alpha = composite(splats, camera.height, camera.width, background)
+    return rgb.to(means.dtype), alpha.to(means.dtype)
+
+
+def project_gaussians(means: Tensor, scales: Tensor, colors: Tensor, camera: Camera) -> Splats:
+    """World Gaussians -> splats of this camera, without those behind the near plane and the non-finite ones.
+
+    Means [N, 3] m, scales [N] m, colors [N, C]. Positions are float64 whatever the inputs are, so that the order of
+    depth is the same in every back end.
+    """
+    splats = _project(means, scales, colors, camera)
+    drawable = _drawable(splats)
+    if not drawable.all():
+        # projected anew without the bad ones: masking afterwards would still send NaN through the backward pass
+        keep = drawable.nonzero()[:, 0]
+        splats = _project(means[keep], scales[keep], colors[keep], camera)
+    return splats
+
+
+def _project(means: Tensor, scales: Tensor, colors: Tensor, camera: Camera) -> Splats:
+    K = np.triu(camera.K)
+    K[2, 2] = 1.0
+    to_pixels = torch.from_numpy((K @ camera.R).T).to(means.device)
+    p = torch.addmm(torch.from_numpy(K @ camera.t).to(means.device), means.double(), to_pixels)
+    z = p[:, 2]
+    variance = K[0, 0] * K[1, 1] * (scales.double() / z).square() + LOW_PASS
+    return Splats(p[:, :2] / z[:, None], variance, z.detach().float(), colors)
+
+
+@torch.no_grad()
+def _drawable(splats: Splats) -> Tensor:
+    """[N] bool: in front of the near plane, and every value finite in float32."""
+    # the sum of a row is finite if and only if its values are, short of an overflow that is as bad
+    total = splats.xy.float().sum(1) + splats.variance.float() + splats.depth + splats.colors.float().sum(1)
+    return total.isfinite() & (splats.depth > NEAR)
+
+
+def _check(
+    means: Tensor, scales: Tensor, colors: Tensor, camera: Camera, background: Sequence[float] | Tensor
+) -> Tensor:
+    """Raise ValueError for what cannot be drawn; the background as [C] in the dtype and on the device of `means`."""
+    if camera.distortion is not None:
+        raise ValueError("splat camera: expected no lens distortion; undistort the image and use camera.undistorted()")
+    n = len(means)
+    if means.shape != (n, 3) or scales.shape != (n,) or colors.ndim != 2 or len(colors) != n or colors.shape[1] < 1:
+        raise ValueError(
+            "splats: expected means [N, 3], scales [N], colors [N, C], got "
+            f"{list(means.shape)}, {list(scales.shape)}, {list(colors.shape)}"
+        )
+    background = torch.as_tensor(background, dtype=torch.float64).detach().to(means.device)
+    channels = colors.shape[1]
+    if background.numel() not in (1, channels):
+        raise ValueError(f"splat background: expected 1 or {channels} values, got {background.numel()}")
+    return background.reshape(-1).expand(channels)
+
+
+def _choose_backend(backend: str, device: torch.device) -> str:
+    if backend not in BACKENDS:
+        raise ValueError(f"splat back end {backend!r}: expected one of {', '.join(BACKENDS)}")
+    if backend == "auto":
+        if device.type == "cuda":
+            backend = "gsplat"
+        elif device.type == "cpu" and find_spec("numba") is not None:
+            backend = "numba"
+        else:
+            backend = "reference"
+    if backend == "numba":
+        if find_spec("numba") is None:
+            raise ImportError("splat back end 'numba' asked for, but numba is not installed: pip install numba")
+        if device.type != "cpu":
+            raise ValueError(f"splat back end 'numba': expected tensors on the CPU, got {device}")
+    return backend

@@ -1,0 +1,237 @@
+"""From a capture's stored images to the training and test views of a protocol.
+
+Order of operations, as in the released ZJU readers: occluder strip on the silhouette of the original image, lens
+undistortion with unchanged K, background paint outside the silhouette, resampling, 8 bit.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from threading import Lock
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench.camera import Camera
+from ihbench.errors import BadInput
+from ihbench.occlusion import Occlusion, apply_rule
+from ihbench.protocol import ImageRule, Protocol
+from ihbench.scene import Capture, MaskState, TestView, TrainView
+
+View = TypeVar("View")
+MAX_HELD = 700  # views kept in memory: 512² training views of this many take about 700 MB
+
+
+class LazyViews(Sequence[View]):
+    """A sequence whose items are made on first use and kept, at most `held` of them (the oldest goes first)."""
+
+    def __init__(self, make: Callable[[int], View], length: int, held: int = MAX_HELD):
+        self._make, self._length, self._held = make, length, held
+        self._kept: OrderedDict[int, View] = OrderedDict()
+        self._lock = Lock()
+
+    def __len__(self) -> int:
+        return self._length
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(self._length))]
+        if not -self._length <= index < self._length:
+            raise IndexError(f"view {index} of {self._length}")
+        index %= self._length
+        with self._lock:
+            if index in self._kept:
+                self._kept.move_to_end(index)
+                return self._kept[index]
+        view = self._make(index)
+        with self._lock:
+            self._kept[index] = view
+            while len(self._kept) > self._held:
+                self._kept.popitem(last=False)
+        return view
+
+    def preload(self, workers: int = 2) -> None:
+        """Make the first `held` items now, on several threads (image decoding releases the interpreter lock)."""
+        with ThreadPoolExecutor(workers) as pool:
+            for _ in pool.map(self.__getitem__, range(min(self._length, self._held))):
+                pass
+
+
+@dataclass(frozen=True)
+class TestViewKey:
+    """Which test view a score belongs to."""
+
+    __test__ = False
+
+    camera: int
+    frame: int
+    camera_id: str
+
+    @property
+    def name(self) -> str:
+        return f"{self.camera_id}/{self.frame:06d}"
+
+
+@dataclass(frozen=True)
+class OccludedScene:
+    """One capture under one protocol: what goes to the method, and what is kept back for scoring."""
+
+    capture: Capture
+    protocol: Protocol
+    occlusion: Occlusion
+    train: LazyViews[TrainView]
+    test_keys: tuple[TestViewKey, ...]
+    test: LazyViews[TestView]
+    covered: tuple[bool, ...]  # per training view
+
+
+class Undistorter:
+    """Lens undistortion and resampling of one camera's images, with its pixel maps computed once."""
+
+    def __init__(self, camera: Camera, rule: ImageRule):
+        import cv2
+
+        self._cv2, self._rule = cv2, rule
+        self._flags = {
+            "nearest": cv2.INTER_NEAREST,
+            "linear": cv2.INTER_LINEAR,
+            "area": cv2.INTER_AREA,
+            "lanczos4": cv2.INTER_LANCZOS4,
+        }
+        self._maps = None
+        if rule.undistort and camera.distortion is not None and camera.distortion.any():
+            self._maps = cv2.initUndistortRectifyMap(
+                camera.K_opencv,
+                camera.distortion,
+                np.eye(3),
+                camera.K_opencv,
+                (camera.width, camera.height),
+                cv2.CV_16SC2,
+            )
+            camera = camera.undistorted()
+        self.camera = camera.scaled(rule.size, rule.size)
+
+    def straighten(self, image: NDArray[Any]) -> NDArray[Any]:
+        if self._maps is None:
+            return image
+        return self._cv2.remap(image, self._maps[0], self._maps[1], self._cv2.INTER_LINEAR)
+
+    def shrink(self, image: NDArray[Any], how: str) -> NDArray[Any]:
+        return self._cv2.resize(image, (self._rule.size, self._rule.size), interpolation=self._flags[how])
+
+    def composite(self, image: NDArray[np.uint8], silhouette: NDArray[np.bool_]) -> NDArray[np.uint8]:
+        """The person of the original image on the protocol's background, undistorted, resampled, 8 bit."""
+        background = np.asarray(self._rule.background, np.float32) * 255
+        alpha = self.straighten(silhouette.astype(np.uint8) * 255).astype(np.float32)[..., None] / 255
+        if self._rule.edge == "hard":
+            alpha = (alpha >= 0.5).astype(np.float32)
+        full = self.straighten(image) * alpha + background * (1 - alpha)
+        small = np.clip(self.shrink(full, self._rule.resample_image), 0, 255)
+        return (small + (0.5 if self._rule.to_8bit == "round" else 1e-3)).astype(np.uint8)
+
+    def mask(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """A silhouette of the original image, undistorted and resampled."""
+        alpha = self.straighten(mask.astype(np.uint8) * 255)
+        if self._rule.edge == "hard":
+            alpha = np.where(alpha >= 128, 255, 0).astype(np.uint8)
+        return self.shrink(alpha, self._rule.resample_mask) >= 128
+
+    def touched(self, hidden: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Pixels with any part of a hidden original pixel in them: their colour is not to be trusted."""
+        return self.shrink((self.straighten(hidden.astype(np.uint8) * 255) > 0).astype(np.float32), "area") > 0
+
+
+def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
+    """Apply a protocol to a capture. Pixels are read lazily.
+
+    Raises `BadInput` when the capture has fewer frames or cameras than the protocol needs.
+    """
+    frames_needed = max(
+        protocol.training_frames(capture.name, capture.n_frames)
+        + protocol.testing_frames(capture.name, capture.n_frames),
+        default=-1,
+    )
+    if frames_needed < 0:
+        raise BadInput(f"{capture.dataset} {capture.name}: {protocol.name} selects no frame of its {capture.n_frames}")
+    if frames_needed >= capture.n_frames:
+        raise BadInput(
+            f"{capture.dataset} {capture.name}: has {capture.n_frames} frames, {protocol.name} needs frame "
+            f"{frames_needed}; use a complete copy or another protocol"
+        )
+    n_cameras = len(capture.camera_ids)
+    if protocol.train_camera >= n_cameras:
+        raise BadInput(f"{capture.dataset} {capture.name}: has {n_cameras} cameras, training needs camera index {protocol.train_camera}")
+    occlusion, frames, covered = apply_rule(protocol, capture)
+    train_camera = capture.camera(protocol.train_camera)
+    hidden = occlusion.hidden(train_camera.height)
+    undistort = {protocol.train_camera: Undistorter(train_camera, protocol.image)}
+    hidden_small = undistort[protocol.train_camera].touched(np.ascontiguousarray(hidden))
+
+    def silhouette(camera: int, frame: int) -> NDArray[np.bool_]:
+        return capture.silhouette(camera, frame, protocol.silhouette)
+
+    def train_view(k: int) -> TrainView:
+        lens, frame = undistort[protocol.train_camera], frames[k]
+        person = silhouette(protocol.train_camera, frame)
+        if covered[k]:
+            person = person & ~hidden
+        state = np.where(lens.mask(person), MaskState.PERSON, MaskState.BACKGROUND).astype(np.uint8)
+        if covered[k]:
+            state[hidden_small] = MaskState.UNKNOWN
+        image = lens.composite(capture.image(protocol.train_camera, frame), person)
+        if covered[k]:
+            image[hidden_small] = np.round(np.asarray(protocol.image.background) * 255)
+        return TrainView(
+            image, state, lens.camera, capture.body_pose(frame), frame, capture.camera_ids[protocol.train_camera]
+        )
+
+    keys = tuple(
+        TestViewKey(camera, frame, capture.camera_ids[camera])
+        for camera in protocol.testing_cameras(n_cameras)
+        for frame in protocol.testing_frames(capture.name, capture.n_frames)
+    )
+    if not keys:
+        raise BadInput(f"{capture.dataset} {capture.name}: {protocol.name} leaves no test view ({n_cameras} cameras)")
+
+    def test_view(k: int) -> TestView:
+        key = keys[k]
+        if key.camera not in undistort:
+            undistort[key.camera] = Undistorter(capture.camera(key.camera), protocol.image)
+        lens, person = undistort[key.camera], silhouette(key.camera, key.frame)
+        image = lens.composite(capture.image(key.camera, key.frame), person)
+        return TestView(
+            image.astype(np.float32) / 255,
+            lens.mask(person),
+            lens.camera,
+            capture.body_pose(key.frame),
+            key.frame,
+            key.camera_id,
+        )
+
+    return OccludedScene(
+        capture,
+        protocol,
+        occlusion,
+        LazyViews(train_view, len(frames)),
+        keys,
+        LazyViews(test_view, len(keys), held=64),
+        tuple(covered),
+    )
+
+
+def hidden_fraction(scene: OccludedScene) -> float:
+    """Share of the pooled person pixels of the covered training frames that the occluder hides, original pixels."""
+    protocol, capture = scene.protocol, scene.capture
+    person = hidden = 0
+    for view_frame, covered in zip(
+        protocol.training_frames(capture.name, capture.n_frames), scene.covered, strict=True
+    ):
+        if covered:
+            silhouette = capture.silhouette(protocol.train_camera, view_frame, protocol.silhouette)
+            person += int(silhouette.sum())
+            hidden += int(silhouette[:, scene.occlusion.columns].sum())
+    return hidden / person if person else 0.0

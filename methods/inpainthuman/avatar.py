@@ -1,0 +1,249 @@
+"""The avatar: Gaussians at the body's UV texels, decoded from UV features, posed by linear blend skinning, splatted."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn.functional import embedding_bag
+
+from ihbench.body import Body
+from ihbench.body.canonical import canonical_pose
+from ihbench.body.uv import chart_padding, texel_table
+from ihbench.camera import Camera
+from ihbench.errors import BadInput
+from ihbench.methods.inpainthuman.config import InpaintHumanConfig
+from ihbench.methods.inpainthuman.decoder import GaussianDecoder, positional_encoding, scale_factor
+from ihbench.methods.inpainthuman.pose_residual import ResidualEncoder, root_free_position_map
+from ihbench.methods.inpainthuman.uv_features import UVFeatures, bilinear_corners
+from ihbench.render.splat import render_gaussians
+from ihbench.render.zbuffer import rasterize
+from ihbench.scene import BodyPose
+
+CULL_SLACK = 0.04  # m behind the nearest body surface; garments and offsets stay well within it
+CULL_BACK_SLACK = 0.012  # m, for points whose normal is turned well away: the far side of an arm, not of a finger
+CULL_FACING = -0.3  # cosine below which a normal is turned well away, beyond the silhouette's rim
+
+
+class GaussianAvatar(nn.Module):
+    """Canonical representation of one person (sec. 3.2). Opacity 1, isotropic scale, identity rotation.
+
+    Points live on the shaped body in the canonical pose; `rest` holds them in the skinning rest pose, where blend
+    weights apply, and `to_rest` turns canonical offsets into rest-pose ones. With a zero offset the posed points lie
+    exactly on the posed body (pose blend shapes aside, which the paper's eq. 2 does not have).
+    """
+
+    weights: Tensor
+    rest: Tensor
+    to_rest: Tensor
+    encoded: Tensor
+    base_scale: Tensor
+
+    def __init__(self, config: InpaintHumanConfig, body: Body, betas: NDArray[np.float64], seed: int):
+        super().__init__()
+        self.config, self.body, self.betas = config, body, np.asarray(betas, np.float64)
+        self.residual_on = False
+        generator = torch.Generator().manual_seed(seed)
+        texels = texel_table(body, config.texels)
+        self.texels = texels
+
+        vertices, _ = body.shaped(self.betas)
+        weights = texels.interpolate(body.weights, body.faces)
+        weights /= weights.sum(1, keepdims=True)
+        rest = texels.interpolate(vertices, body.faces)
+        canonical = BodyPose(canonical_pose(config.canonical_pose), self.betas, np.zeros(3))
+        blended = np.einsum("nk,kab->nab", weights, body.joint_transforms(canonical)[:, :3])
+        points = np.einsum("nab,nb->na", blended[:, :, :3], rest) + blended[:, :, 3]
+
+        corners = vertices[body.faces]
+        face_area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+        per_face = np.bincount(texels.face, minlength=len(body.faces))
+        spacing = np.sqrt(_smoothed_area(texels.face, face_area, per_face, body.faces))
+
+        for name, value in (
+            ("weights", weights),
+            ("rest", rest),
+            ("to_rest", np.linalg.inv(blended[:, :, :3])),
+            ("base_scale", np.minimum(config.scale_initial * spacing, config.scale_limit)),
+        ):
+            self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(value, np.float32)), persistent=False)
+        encoded = positional_encoding(torch.from_numpy(points), config.encoding_frequencies).float()
+        self.register_buffer("encoded", encoded, persistent=False)
+
+        self.features = UVFeatures(
+            [self._corners(r) for r in config.levels],
+            config.levels,
+            config.channels,
+            config.feature_std,
+            config.fusion,
+            generator,
+        )
+        width = self.features.out_channels
+        self.decoder = GaussianDecoder(width + encoded.shape[1], config.decoder_width, config.decoder_layers, generator)
+        if config.pose_residual:
+            with torch.random.fork_rng(devices=[]):
+                torch.manual_seed(seed)
+                self.encoder = ResidualEncoder(config.residual_channels, width)
+            index, weight = self._corners(config.position_map)
+            self.register_buffer("residual_index", torch.from_numpy(index), persistent=False)
+            self.register_buffer("residual_weight", torch.from_numpy(weight), persistent=False)
+
+    def _corners(self, resolution: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        inside = texel_table(self.body, resolution).mask
+        return bilinear_corners(self.texels.uv, chart_padding(inside, resolution))
+
+    @property
+    def device(self) -> torch.device:
+        return self.rest.device
+
+    def __len__(self) -> int:
+        return len(self.rest)
+
+    @cached_property
+    def every_point(self) -> Tensor:
+        return torch.arange(len(self), device=self.device)
+
+    def position_map(self, body_pose: BodyPose) -> Tensor | None:
+        """[3, R, R] input of the residual encoder, or None for an avatar without one."""
+        if not self.config.pose_residual:
+            return None
+        positions = root_free_position_map(self.body, body_pose, self.config.position_map)
+        return torch.from_numpy(positions).to(self.device)
+
+    def decode(self, points: Tensor, position_map: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Offset [n, 3] m (canonical axes), scale [n] m, colour [n, 3] and canonical feature [n, C] of some points."""
+        feature = self.features(points)
+        combined = feature
+        if self.residual_on and position_map is not None:
+            combined = feature + embedding_bag(
+                self.residual_index[points],
+                self.encoder(position_map),
+                per_sample_weights=self.residual_weight[points],
+                mode="sum",
+            )
+        raw_offset, raw_scale, color = self.decoder(torch.cat([combined, self.encoded[points]], 1))
+        config = self.config
+        offset = config.offset_scale * (torch.tanh(raw_offset) if config.offset == "tanh" else raw_offset)
+        scale = self.base_scale[points] * scale_factor(raw_scale, config.scale_activation)
+        return offset, scale.clamp(max=config.scale_limit), color, feature
+
+    def pose_points(self, points: Tensor, offset: Tensor, transforms: Tensor) -> Tensor:  # transforms [24, 3, 4]
+        """World positions [n, 3] m of canonical points with offsets, by linear blend skinning (eq. 2)."""
+        rest = self.rest[points] + (self.to_rest[points] @ offset[:, :, None])[:, :, 0]
+        blended = (self.weights[points] @ transforms.reshape(24, 12)).reshape(-1, 3, 4)
+        return (blended[:, :, :3] @ rest[:, :, None])[:, :, 0] + blended[:, :, 3]
+
+    def transforms(self, body_pose: BodyPose) -> Tensor:
+        """[24, 3, 4] rest pose to this pose, with the avatar's own shape."""
+        own = BodyPose(body_pose.pose, self.betas, body_pose.transl)
+        return torch.from_numpy(self.body.joint_transforms(own)[:, :3].astype(np.float32)).to(self.device)
+
+    def unhidden(self, camera: Camera, body_pose: BodyPose) -> NDArray[np.int64]:
+        """Numbers of the points that the posed body itself does not hide from this camera, with slack for offsets.
+
+        With opacity 1 whatever lies behind the first surface contributes nothing, so it need not be decoded.
+        """
+        if not self.config.cull:
+            return np.arange(len(self))
+        from scipy.ndimage import maximum_filter
+
+        vertices = self.body.pose(BodyPose(body_pose.pose, self.betas, body_pose.transl), blend_shapes=False)
+        depth = rasterize(camera.project(vertices), self.body.faces, camera.height, camera.width).depth
+        # the farthest depth around a pixel: near a silhouette nothing is culled by a neighbour
+        depth = maximum_filter(depth, size=3, mode="nearest")
+        corners = vertices[self.body.faces[self.texels.face]]
+        points = np.einsum("nk,nkd->nd", self.texels.bary, corners)
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        view = camera.center - points
+        away = (normals * view).sum(1) < CULL_FACING * np.linalg.norm(normals, axis=1) * np.linalg.norm(view, axis=1)
+        p = camera.project(points)
+        column = np.clip(np.nan_to_num(p[:, 0]), 0, camera.width - 1).astype(int)
+        row = np.clip(np.nan_to_num(p[:, 1]), 0, camera.height - 1).astype(int)
+        slack = np.where(away, CULL_BACK_SLACK, CULL_SLACK)
+        return np.flatnonzero((p[:, 2] > 0) & (p[:, 2] <= depth[row, column] + slack))
+
+    @torch.no_grad()
+    def gaussians(self, body_pose: BodyPose, points: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """World means [n, 3] m, scales [n] m and colours [n, 3] in a pose."""
+        points = self.every_point if points is None else points
+        position_map = self.position_map(body_pose) if self.residual_on else None
+        offset, scale, color, _ = self.decode(points, position_map)
+        return self.pose_points(points, offset, self.transforms(body_pose)), scale, color
+
+    def render(
+        self, camera: Camera, body_pose: BodyPose, background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """rgb [H, W, 3] on `background` and alpha [H, W]; see `ihbench.scene.Avatar`."""
+        points = torch.from_numpy(self.unhidden(camera, body_pose)).to(self.device)
+        with torch.no_grad():
+            rgb, alpha = render_gaussians(*self.gaussians(body_pose, points), camera, background)
+        return rgb.clamp(0, 1).cpu().numpy(), alpha.cpu().numpy()
+
+    def save(self, folder: Path) -> None:
+        """Write `avatar.safetensors` and `avatar.json`: enough to load it again beside the same body."""
+        from safetensors.torch import save_file
+
+        from ihbench.atomic import write_json
+
+        folder.mkdir(parents=True, exist_ok=True)
+        state = {k: v.detach().cpu().contiguous() for k, v in self.state_dict().items()}
+        partial = folder / "avatar.safetensors.part"
+        try:
+            save_file(state, partial)
+            partial.replace(folder / "avatar.safetensors")
+        except OSError as error:
+            partial.unlink(missing_ok=True)
+            raise BadInput(f"{folder}: the avatar cannot be written: {error.strerror or error}") from error
+        write_json(
+            folder / "avatar.json",
+            {
+                "kind": "inpainthuman",
+                "config": asdict(self.config),
+                "betas": self.betas.tolist(),
+                "body": self.body.content_sha(),
+                "residual_on": self.residual_on,
+            },
+        )
+
+    @classmethod
+    def load(cls, folder: Path, body: Body, device: str = "cpu") -> GaussianAvatar:
+        """Read what `save` wrote. Raises `BadInput` for a missing or foreign file or another body."""
+        from safetensors import SafetensorError
+        from safetensors.torch import load_file
+
+        try:
+            words = json.loads((folder / "avatar.json").read_text(encoding="utf-8"))
+            tensors = load_file(folder / "avatar.safetensors")
+        except (OSError, ValueError, SafetensorError) as error:
+            raise BadInput(f"{folder}: no readable avatar there: {error}") from error
+        if words.get("kind") != "inpainthuman":
+            raise BadInput(f"{folder}: holds an avatar of kind {words.get('kind')!r}, expected 'inpainthuman'")
+        if words["body"] != body.content_sha():
+            raise BadInput(f"{folder}: was fitted on another body ({words['body']}) than the one given ({body.content_sha()})")
+        config = {k: tuple(v) if isinstance(v, list) else v for k, v in words["config"].items()}
+        avatar = cls(InpaintHumanConfig(**config), body, np.array(words["betas"]), seed=0)
+        avatar.load_state_dict(tensors)
+        avatar.residual_on = words["residual_on"]
+        return avatar.to(device)
+
+
+def _smoothed_area(
+    face_of_texel: NDArray[np.int32],  # [N]
+    face_area: NDArray[np.float64],  # [F] m²
+    texels_per_face: NDArray[np.int64],  # [F]
+    faces: NDArray[np.int32],  # [F, 3]
+) -> NDArray[np.float64]:
+    """[N] m² of body surface per texel. Small faces hold zero to two texels, so area and count are pooled over the
+    faces around each vertex before they are divided."""
+    area, count = np.zeros(faces.max() + 1), np.zeros(faces.max() + 1)
+    for corner in range(3):
+        area += np.bincount(faces[:, corner], face_area, minlength=len(area))
+        count += np.bincount(faces[:, corner], texels_per_face, minlength=len(count))
+    per_vertex = area / np.maximum(count, 0.5)
+    return per_vertex[faces[face_of_texel]].mean(1)

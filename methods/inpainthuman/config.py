@@ -1,0 +1,111 @@
+"""Every switch of InpaintHuman, with the paper's or the closest released code's value and why it is there.
+
+Section numbers are the paper's; where the paper is silent the value follows GaussianAvatar (aipixel/GaussianAvatar),
+whose representation the paper builds on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from ihbench.plan import Omission, SceneMeasure
+
+STATIC_DEG = 5.0  # below this joint motion nothing depends on the pose
+FINEST_LEVEL = 3.0  # a level whose texels are this many times finer than the pixels cannot be told apart by them
+
+
+@dataclass(frozen=True)
+class InpaintHumanConfig:
+    texels: int = 256
+    """One Gaussian per texel of a square UV grid of this side: 256 gives about 50 k, 512 about 200 k."""
+    levels: tuple[int, ...] = (64, 128, 256)
+    """Sides of the UV feature maps, coarse to fine (sec. 4.2). A single value gives single-scale features."""
+    channels: int = 32
+    """Feature channels per level (sec. 4.2)."""
+    fusion: Literal["sum", "concat"] = "sum"
+    """How levels are joined. The paper sums; concat widens the decoder's input instead."""
+    feature_std: float = 0.01
+    """Standard deviation of the feature maps' initial values."""
+    canonical_pose: Literal["a_pose", "gaussianavatar", "big_pose", "vitruvian", "t_pose"] = "a_pose"
+    """Pose in which points live and are position-encoded (sec. 3.2: "A-pose")."""
+    encoding_frequencies: int = 6
+    """Octaves of the positional encoding of canonical points. More lets the decoder bypass the UV maps."""
+    decoder_layers: int = 3
+    """Linear layers of the decoder (sec. 4.2)."""
+    decoder_width: int = 128
+    """Hidden width of the decoder (sec. 4.2)."""
+    offset: Literal["linear", "tanh"] = "linear"
+    """Output form of the offset from the surface: offset_scale × output, bounded by tanh or not."""
+    offset_scale: float = 0.02
+    """Metres per unit of the decoder's offset output (GaussianAvatar)."""
+    scale_activation: Literal["softplus", "exp"] = "exp"
+    """Turns the decoder's output into a factor on the initial scale."""
+    scale_initial: float = 0.7
+    """Initial Gaussian scale as a multiple of the local texel spacing on the body."""
+    scale_limit: float = 0.02
+    """Upper bound of a Gaussian's scale in metres."""
+    pose_residual: bool = True
+    """Pose-dependent residual features from the position map (sec. 3.2, dynamics)."""
+    position_map: int = 64
+    """Side of the position map that the residual encoder reads (128 in the paper profile)."""
+    residual_channels: int = 16
+    """Base width of the residual encoder (32 in the paper profile)."""
+    residual_start: float = 0.3
+    """Share of the steps after which the residual joins; earlier it would absorb what belongs to the maps."""
+    background_weight: float = 1.0
+    """Weight of the L1 on pixels known to be background. Without it nothing bounds the silhouette."""
+    offset_weight: float = 10.0
+    """Weight of the mean squared offset in m² (GaussianAvatar)."""
+    scale_weight: float = 0.03
+    """Weight of the mean scale in m (GaussianAvatar)."""
+    feature_weight: float = 1.0
+    """Weight of the mean squared feature: texels nobody saw fade to zero, so that the coarse level speaks there."""
+    steps: int = 600
+    """Optimisation steps, one training view each."""
+    lr_maps: float = 5e-3
+    """AdamW step size of the UV feature maps (1e-4 in the paper)."""
+    lr_decoder: float = 2e-3
+    """AdamW step size of the decoder (1e-4 in the paper)."""
+    lr_encoder: float = 5e-4
+    """AdamW step size of the residual encoder (1e-4 in the paper)."""
+    lr_final: float = 0.05
+    """Step sizes fall along a cosine to this share of their start."""
+    clip_gradient: float = 1.0
+    """Bound on the norm of each group's gradient."""
+    cull: bool = True
+    """Leave out Gaussians that the posed body hides before they are decoded. Changes time, hardly the image."""
+    paper_strict: bool = False
+    """Follow the paper's text where it differs from sensible defaults: no background term, no regularisers."""
+
+
+QUICK = InpaintHumanConfig()
+
+PAPER = InpaintHumanConfig(
+    texels=512,
+    steps=3000,
+    position_map=128,
+    residual_channels=32,
+    lr_maps=1e-4,
+    lr_decoder=1e-4,
+    lr_encoder=1e-4,
+    lr_final=1.0,
+)
+
+PROFILES = {"quick": QUICK, "paper": PAPER}
+
+
+def leave_out(config: InpaintHumanConfig, scene: SceneMeasure) -> list[Omission]:
+    """What this scene does not need of this configuration (see `ihbench.plan`)."""
+    found = []
+    if config.pose_residual and scene.motion_deg < STATIC_DEG:
+        reason = f"no joint turns more than {scene.motion_deg:.1f}° over the training frames (limit {STATIC_DEG}°)"
+        found.append(Omission("pose_residual", False, reason))
+    useful = tuple(r for r in config.levels if scene.texel_mm(r) * FINEST_LEVEL >= scene.pixel_mm)
+    if useful and useful != config.levels:
+        reason = (
+            f"a pixel covers {scene.pixel_mm:.1f} mm of the body; levels {config.levels} go down to "
+            f"{scene.texel_mm(max(config.levels)):.1f} mm"
+        )
+        found.append(Omission("levels", useful, reason))
+    return found

@@ -1,0 +1,47 @@
+"""The Gaussian parameter decoder (sec. 3.2, eq. 1): features and encoded position -> offset, scale factor, colour."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import softplus
+
+SOFTPLUS_ONE = math.log(math.e - 1)  # softplus of this is 1
+
+
+def positional_encoding(points: Tensor, frequencies: int) -> Tensor:  # [N, 3] m -> [N, 3 + 6 F]
+    """The points themselves, then sine and cosine at 1, 2, 4, … radians per metre × π."""
+    scaled = points[:, :, None] * (math.pi * 2.0 ** torch.arange(frequencies, dtype=points.dtype))
+    flat = scaled.reshape(len(points), 3 * frequencies)
+    return torch.cat([points, flat.sin(), flat.cos()], 1)
+
+
+class GaussianDecoder(nn.Module):
+    """`layers` linear layers with ReLU between. The last starts at zero, so a fit begins on the surface, at the
+    initial scale, in grey."""
+
+    def __init__(self, in_features: int, width: int, layers: int, generator: torch.Generator):
+        super().__init__()
+        sizes = [in_features] + [width] * (layers - 1) + [7]
+        self.linear = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes[:-1], sizes[1:], strict=True))
+        for layer in self.linear:
+            bound = 1 / math.sqrt(layer.in_features)
+            nn.init.uniform_(layer.weight, -bound * math.sqrt(3), bound * math.sqrt(3), generator=generator)
+            nn.init.zeros_(layer.bias)
+        nn.init.zeros_(self.linear[-1].weight)
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Raw outputs: offset [n, 3], scale [n], colour [n, 3] in [0, 1]."""
+        for layer in self.linear[:-1]:
+            features = torch.relu(layer(features))
+        out = self.linear[-1](features)
+        return out[:, :3], out[:, 3], torch.sigmoid(out[:, 4:])
+
+
+def scale_factor(raw: Tensor, activation: str) -> Tensor:
+    """A positive factor, 1 at 0. `exp` is cut at e^±5, beyond which the scale limit rules anyway."""
+    if activation == "softplus":
+        return softplus(raw + SOFTPLUS_ONE)
+    return torch.exp(raw.clamp(-5, 5))

@@ -1,0 +1,37 @@
+"""InpaintHuman as a registered method."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ihbench.body import Body
+from ihbench.ledger import Ledger
+from ihbench.methods.inpainthuman.avatar import GaussianAvatar
+from ihbench.methods.inpainthuman.config import InpaintHumanConfig
+from ihbench.methods.inpainthuman.stage1 import Stage1
+from ihbench.progress import Progress
+from ihbench.scene import TrainingSet
+
+
+class InpaintHuman:
+    """Multi-scale UV Gaussians, fitted to the visible pixels (stage 1 of the paper)."""
+
+    def __init__(self, config: InpaintHumanConfig):
+        self.config = config
+
+    def fit(
+        self, training: TrainingSet, *, device: str, seed: int, ledger: Ledger, progress: Progress
+    ) -> GaussianAvatar:
+        """Fit one person. See `ihbench.scene.Method`."""
+        with ledger.stage("fit/prepare"):
+            betas = np.mean([view.body_pose.betas for view in training.views], axis=0)
+            avatar = GaussianAvatar(self.config, training.body, betas, seed).to(device)
+        with ledger.stage("fit/stage1"):
+            Stage1(avatar, training, seed, ledger).run(progress)
+        return avatar
+
+    def load(self, folder: Path, body: Body, device: str = "cpu") -> GaussianAvatar:
+        """Read an avatar written by `GaussianAvatar.save`."""
+        return GaussianAvatar.load(folder, body, device)
