@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera
 from ihbench.render.zbuffer import rasterize
 from ihbench.scene import BodyPose, MaskState, TestView, TrainView
@@ -116,11 +117,9 @@ class Calibration:
 def _view_distance(camera_a: Camera, pose_a: BodyPose, camera_b: Camera, pose_b: BodyPose) -> float:
     """How differently two cameras see two poses: angle between the view directions in the body's frame, plus the mean
     joint angle between the poses; radians."""
-    from scipy.spatial.transform import Rotation
-
     directions = []
     for camera, pose in ((camera_a, pose_a), (camera_b, pose_b)):
-        d = Rotation.from_rotvec(pose.pose[0]).inv().apply(camera.center - pose.transl)
+        d = (camera.center - pose.transl) @ axis_angle_to_matrix(pose.pose[0])
         directions.append(d / np.linalg.norm(d))
     angle = np.arccos(np.clip(directions[0] @ directions[1], -1, 1))
     return float(angle + np.linalg.norm(pose_a.pose[1:] - pose_b.pose[1:], axis=1).mean())

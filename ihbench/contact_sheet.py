@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-COLUMNS = ("training input", "truth", "prediction", "error ×4")
+COLUMNS = ("training input", "truth", "prediction", "error x4")
 PAD, LABEL = 6, 18  # px
 GREY = 70
 
@@ -59,7 +59,7 @@ def contact_sheet(rows: Sequence[SheetRow], title: str) -> NDArray[np.uint8]:
 
 
 def write_png(path: Path, image: NDArray[np.uint8]) -> None:
-    """Write an RGB image atomically. Raises `BadInput` when the disk does not take it."""
+    """Write an RGB image whole or not at all. Raises `BadInput` when the disk does not take it."""
     import io
 
     from PIL import Image
@@ -67,8 +67,8 @@ def write_png(path: Path, image: NDArray[np.uint8]) -> None:
     from ihbench.atomic import write_bytes
 
     buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, "PNG")
-    write_bytes(path, buffer.getvalue())
+    Image.fromarray(image).save(buffer, "PNG", compress_level=3)
+    write_bytes(path, buffer.getvalue(), durable=False)
 
 
 def _to_8bit(image: NDArray[np.float32]) -> NDArray[np.uint8]:

@@ -18,7 +18,7 @@ def identity() -> dict[str, Any]:
     Host names and user names are left out: run folders are shared.
     """
     torch = sys.modules.get("torch")
-    facts: dict[str, Any] = {
+    return {
         "cpu": cpu_model(),
         "cores": os.cpu_count() or 1,
         "cores_usable": usable_cores(),
@@ -27,10 +27,9 @@ def identity() -> dict[str, Any]:
         "python": platform.python_version(),
         "torch": str(torch.__version__) if torch is not None else None,
         "torch_threads": torch.get_num_threads() if torch is not None else None,
-        "gpu": torch.cuda.get_device_name() if _cuda_in_use() else None,
+        "gpu": sys.modules["torch"].cuda.get_device_name() if _cuda_in_use() else None,
         "load_average": [round(value, 2) for value in os.getloadavg()] if hasattr(os, "getloadavg") else None,
     }
-    return facts
 
 
 def cpu_model() -> str:

@@ -6,12 +6,16 @@ Nothing here imports torch or cv2: `ihbench plan` answers fast.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ihbench.atomic import read_json
+from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera
+from ihbench.errors import BadInput
 from ihbench.occlusion import Occlusion, apply_rule
 from ihbench.protocol import Protocol
 from ihbench.scene import BodyPose, Capture, MaskState
@@ -130,11 +134,22 @@ def _mask_view(capture: Capture, protocol: Protocol, occlusion: Occlusion, frame
 
 def _turn(roots: NDArray[np.float64]) -> float:  # [F, 3] rad
     """Degrees between the extreme headings of the body's front, unwrapped over the frames."""
-    from scipy.spatial.transform import Rotation
-
-    front = Rotation.from_rotvec(roots).apply([0.0, 0.0, 1.0])
+    front = axis_angle_to_matrix(roots)[:, :, 2]
     # the two world axes in which the front moves most span the ground plane, whichever axis is up
     _, _, axes = np.linalg.svd(front - front.mean(0), full_matrices=False)
     plane = front @ axes[:2].T
     centred = np.unwrap(np.arctan2(plane[:, 1], plane[:, 0]))
     return float(np.rad2deg(np.ptp(centred)))
+
+
+def expected_seconds(runs: Path, method: str, profile: str) -> float | None:
+    """Median total seconds of finished runs of this method and profile under `runs`; None without any."""
+    seconds = []
+    for path in runs.glob("*/run.json"):
+        try:
+            record = read_json(path)
+            if record["status"] == "done" and (record["identity"]["method"], record["identity"]["profile"]) == (method, profile):
+                seconds.append(float(record["about"]["total_seconds"]))
+        except (BadInput, KeyError, TypeError, ValueError):
+            continue  # a damaged record tells nothing about time
+    return float(np.median(seconds)) if seconds else None

@@ -24,7 +24,7 @@ class Progress:
             task.advance()
             task.note(f"loss {loss:.4f}")
 
-    `mode` is "bar", "plain", "silent", or "auto": a bar when stderr is a terminal and CI is not set, else plain lines.
+    `mode` is "bar", "plain", "silent", or "auto": a bar if stderr is a terminal and CI is not set, else plain lines.
     """
 
     def __init__(
@@ -134,10 +134,16 @@ def duration(seconds: float) -> str:
 
 def _rich_bars(stream: TextIO) -> Any:
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        ProgressColumn,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
     from rich.progress import Progress as RichProgress
     from rich.progress import Task as RichTask
-    from rich.progress import TimeRemainingColumn
     from rich.text import Text
 
     class Note(ProgressColumn):

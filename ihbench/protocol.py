@@ -10,7 +10,7 @@ import hashlib
 import json
 import tomllib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +94,12 @@ class Protocol:
         """16 hex digits over every choice; two protocols with one digest mean the same numbers."""
         words = {k: v for k, v in self.content.items() if k not in ("title", "reason", "source")}
         return hashlib.sha256(json.dumps(words, sort_keys=True).encode()).hexdigest()[:16]
+
+    def with_occlusion(self, rule: str) -> Protocol:
+        """The same protocol under another occlusion rule; its digest differs, so numbers never mix."""
+        content = {**self.content, "occlusion": {**self.content["occlusion"], "rule": rule, "unlisted": rule}}
+        replaced = _build(content, self.profile)
+        return replace(replaced, version=f"{self.version}+occlusion={rule}")
 
     def training_frames(self, subject: str, n_frames: int) -> list[int]:
         """Raw frame numbers of the training images."""

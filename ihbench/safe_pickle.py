@@ -1,8 +1,8 @@
 """Read pickles without running what they say: SMPL model files, and the `.npy`/`.pkl` files of capture data sets.
 
 A pickle is a program. This reader executes it with nothing to call but a handful of functions of its own, which can
-only build plain Python values and numpy arrays of numbers, text or objects. chumpy and scipy.sparse objects, which old
-SMPL files hold, come back as inert `ForeignObject`s that carry their state.
+only build plain Python values and numpy arrays of numbers, text or objects. chumpy and scipy.sparse objects, which
+old SMPL files hold, come back as inert `ForeignObject`s that carry their state.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import math
 import pickle
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -20,14 +20,12 @@ from ihbench.errors import BadInput
 
 
 class ForeignObject:
-    """Stands for an object of a library this reader never imports. `kind` is its full name, `state` its attributes."""
+    """Stands for an object of a library this reader never imports: its full name and its attributes."""
 
-    kind: str = ""
+    kind: str = ""  # e.g. "chumpy.ch.Ch"
+    state: dict[str, Any]
 
-    def __init__(self, *args: object):
-        self.state: dict[str, Any] = {}
-
-    def __new__(cls, *args: object) -> ForeignObject:
+    def __new__(cls, *_args: object) -> ForeignObject:
         self = super().__new__(cls)
         self.state = {}
         return self
@@ -52,7 +50,7 @@ class _DtypeRecord:
         dtype = np.dtype("O") if self.name[:1] == "O" else np.dtype(self.name)
         if dtype.kind not in "biufcSUO" or dtype.fields is not None or dtype.subdtype is not None:
             raise pickle.UnpicklingError(f"refused numpy dtype {self.name!r}")
-        return dtype if self.order in "=|" else dtype.newbyteorder(self.order)
+        return dtype.newbyteorder(">") if self.order == ">" else dtype
 
 
 class _ArrayRecord:
@@ -149,14 +147,15 @@ def _as_bytes(data: object) -> bytes | bytearray:
     raise pickle.UnpicklingError("expected the bytes of a numpy array")
 
 
-class SafeUnpickler(pickle._Unpickler):  # pyright: ignore[reportAttributeAccessIssue]
-    """An unpickler that can only build plain values, numpy arrays and `ForeignObject`s.
+# The pure-Python unpickler, because its opcodes can be replaced, its memo is a dictionary (the C one allocates as
+# many slots as the highest index a file names) and the extension registry, which bypasses `find_class`, can be shut.
+_PythonUnpickler: Any = pickle._Unpickler  # pyright: ignore[reportAttributeAccessIssue]
 
-    The pure-Python unpickler, because its opcodes can be replaced, its memo is a dictionary (the C one allocates as
-    many slots as the highest index a file names) and the extension registry, which bypasses `find_class`, can be shut.
-    """
 
-    dispatch = dict(pickle._Unpickler.dispatch)  # pyright: ignore[reportAttributeAccessIssue]
+class SafeUnpickler(_PythonUnpickler):
+    """An unpickler that can only build plain values, numpy arrays and `ForeignObject`s."""
+
+    dispatch: ClassVar[dict[int, Callable]] = dict(_PythonUnpickler.dispatch)
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) in _ALLOWED:
@@ -246,7 +245,7 @@ def _build_array(record: _ArrayRecord, done: dict[int, tuple[Any, Any]]) -> np.n
     raw = _as_bytes(data)
     if len(raw) != count * dtype.itemsize:
         raise pickle.UnpicklingError(
-            f"an array of shape {shape} and dtype {dtype} needs {count * dtype.itemsize} bytes, the file has {len(raw)}"
+            f"an array of shape {shape} and {dtype} needs {count * dtype.itemsize} bytes, the file has {len(raw)}"
         )
     array = np.frombuffer(raw, dtype, count) if count and dtype.itemsize else np.zeros(count, dtype)
     native = dtype.newbyteorder("=")

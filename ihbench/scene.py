@@ -118,9 +118,16 @@ class Dataset(Protocol):
 
     def __init__(self, root: Path): ...
 
+    @staticmethod
+    def check(root: Path) -> dict[str, Any]:
+        """What a folder holds and lacks, as plain data with a boolean "ok". Raises `BadInput` for another layout."""
+        ...
+
     def subjects(self) -> list[str]: ...
 
-    def open(self, subject: str) -> Capture: ...
+    def open(self, subject: str, body: Body | None = None) -> Capture:
+        """One subject. `body` is the model its poses belong to; poses of real data cannot be read without it."""
+        ...
 
 
 class Avatar(Protocol):

@@ -1,8 +1,8 @@
-"""Exercises on the spot with turns, as the ZJU-MoCap subjects perform them, and the steps that keep feet on the floor.
+"""Exercises on the spot with turns, as the ZJU-MoCap subjects perform them, with the feet on the floor.
 
-Angles are written in degrees of SMPL axis-angle at the T-pose that looks along +z with the left hand at +x: a negative
-hip x lifts the thigh forwards, a positive knee x bends it, a negative left shoulder z lowers the arm, a negative left
-shoulder or elbow y brings the arm forwards. On the right side y and z change sign.
+Angles are written in degrees of SMPL axis-angle at the T-pose that looks along +z with the left hand at +x: a
+negative hip x lifts the thigh forwards, a positive knee x bends it, a negative left shoulder z lowers the arm, a
+negative left shoulder or elbow y brings the arm forwards. On the right side y and z change sign.
 """
 
 from __future__ import annotations

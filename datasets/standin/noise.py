@@ -18,9 +18,7 @@ def value_noise(points: NDArray[np.floating], seed: int, frequency: float) -> ND
     return _kernel()(np.ascontiguousarray(points, np.float64), np.uint32(seed & 0xFFFFFFFF), float(frequency))
 
 
-def fractal_noise(
-    points: NDArray[np.floating], seed: int, frequency: float, octaves: int = 3
-) -> NDArray[np.float32]:
+def fractal_noise(points: NDArray[np.floating], seed: int, frequency: float, octaves: int = 3) -> NDArray[np.float32]:
     """Octaves of `value_noise` at points [N, 3], each twice as fine and half as strong; in [0, 1]."""
     total = np.zeros(len(points), np.float32)
     for octave in range(octaves):

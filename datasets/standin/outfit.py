@@ -12,6 +12,8 @@ from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+from scipy.sparse import coo_array, csr_array, diags_array
 
 from ihbench.body import Body
 from ihbench.body.skeleton import JOINT_INDEX
@@ -145,7 +147,7 @@ class Chart:
     def __init__(self, points: Array, groups: Array, body: Body):
         """`points` [N, 3] m on the rest-pose body, `groups` [N, 4] from `limb_groups`."""
         J = self.joints = body.joints
-        self.points = points
+        self.points, self.groups, self.body = points, groups, body
         self.x, self.y, self.z = points.T
         group = groups.argmax(1)
         self.torso, self.head, self.arm, self.leg = (group == k for k in range(4))
@@ -167,7 +169,8 @@ class Chart:
         ) / (2 * np.pi)
         self.hem = J[0, 1] - 0.055  # where the top ends
         self.waist = J[0, 1] - 0.045  # where the trousers end below the top
-        self.sole = points[:, 1].min() if len(points) else 0.0
+        self.sole = body.v_template[:, 1].min()
+        self.fingertips = body.v_template[:, 0].max()
         head, neck = J[JOINT_INDEX["head"]], J[JOINT_INDEX["neck"]]
         landmarks = (0.031, head[1] + 0.085, head[1] + 0.027) if body.face_landmarks is None else body.face_landmarks
         self.eye_x, self.eye_y, self.mouth_y = landmarks
@@ -175,6 +178,10 @@ class Chart:
         # round neckline, lower in front
         self.collar = self.y - (neck[1] - 0.030 - 0.35 * np.clip(self.z - neck[2], 0, 0.14))
         self.neck_distance = np.hypot(self.x, self.z - neck[2])
+
+    def at(self, where: NDArray[np.bool_]) -> Chart:
+        """The chart of some of the points."""
+        return Chart(self.points[where], self.groups[where], self.body)
 
 
 def joint(name: str, joints: Array) -> Array:
@@ -234,15 +241,12 @@ def _hair(c: Chart, style: Style) -> NDArray[np.bool_]:
 def albedo(c: Chart, style: Style) -> NDArray[np.float32]:
     """[N, 3] sRGB colour of every point, without light."""
     label = part_labels(c, style)
-    out = _skin(c, style)
-    for part, paint in (
-        ((Part.UPPER_CLOTHES,), _top),
-        ((Part.TROUSERS,), _bottom),
-        ((Part.LEFT_SHOE, Part.RIGHT_SHOE), _shoes),
-        ((Part.HAIR,), _hair_colour),
-    ):
-        here = np.isin(label, part)
-        out[here] = paint(c, style)[here]
+    painters = {Part.UPPER_CLOTHES: _top, Part.TROUSERS: _bottom, Part.HAIR: _hair_colour}
+    painters |= {Part.LEFT_SHOE: _shoes, Part.RIGHT_SHOE: _shoes}
+    out = np.empty((len(label), 3))
+    for part in np.unique(label):
+        here = label == part
+        out[here] = painters.get(Part(part), _skin)(c.at(here), style)
     return np.clip(out, 0, 1).astype(np.float32)
 
 
@@ -303,7 +307,7 @@ def _skin(c: Chart, style: Style) -> Array:
     _paint(out, face * _stroke(eye, up, (-0.015, 0.0195), (0.004, 0.0235), 0.0058), brow)
     _paint(out, face * _stroke(eye, up, (0.004, 0.0235), (0.019, 0.0185), 0.0045), brow)
     _paint(out, 0.8 * face * _ellipse(x - 0.0075, up + 0.034, 0.0042, 0.0028), skin * (0.45, 0.32, 0.30))  # nostrils
-    nails = c.arm & (np.abs(c.x) > np.abs(c.x).max() - 0.012)
+    nails = c.arm & (np.abs(c.x) > c.fingertips - 0.012)
     _paint(out, 0.5 * nails, (0.95, 0.80, 0.76))
     return out
 
@@ -413,7 +417,11 @@ def _sewing(out: Array, c: Chart, style: Style, main: Array, second: Array, acce
     _paint(out, _band(c.collar, -0.022, 0.05) * (c.neck_distance < NECK_OPENING + 0.018), rib)
     _paint(out, 0.6 * _band(c.arm_along, -0.10, -0.07) * c.arm, dark)  # shoulder seam
     if style.top in ("shirt", "polo"):
-        _paint(out, _band(c.collar, -0.045, 0.05) * (c.neck_distance < NECK_OPENING + 0.03), main * 0.85 if style.top == "shirt" else second)
+        _paint(
+            out,
+            _band(c.collar, -0.045, 0.05) * (c.neck_distance < NECK_OPENING + 0.03),
+            main * 0.85 if style.top == "shirt" else second,
+        )
         placket_end = c.hem if style.top == "shirt" else c.joints[JOINT_INDEX["spine3"], 1] + 0.02
         _paint(out, front * _band(c.x, -0.015, 0.015) * _inside(c.y - placket_end), main * 0.8)
         button = np.mod(c.y - c.hem, 0.075) - 0.037
@@ -478,13 +486,17 @@ def _shoes(c: Chart, style: Style) -> Array:
     forward = c.z - ankle[2]
     middle = np.abs(c.x) - np.interp(forward, [0, 0.14], [ankle[0], ankle[0] + 0.012])
     _paint(out, _inside(forward - 0.115) * _inside(above_sole - 0.02), upper * 0.8)  # toe cap
-    laces = _band(np.mod(forward, 0.016), 0.004, 0.010) * _band(forward, 0.035, 0.10) * _inside(0.020 - np.abs(middle))
+    laces = (
+        _band(np.mod(forward, 0.016), 0.004, 0.010) * _band(forward, 0.035, 0.10) * _inside(0.020 - np.abs(middle))
+    )
     _paint(out, laces * _inside(above_sole - 0.03), trim)
     for start in (0.0, 0.022):
         swoosh = _stroke(forward, above_sole, (start, 0.030), (start + 0.025, 0.065), 0.009)
         _paint(out, swoosh * (np.abs(middle) > 0.018), trim)
     _paint(out, _inside(0.020 - above_sole), trim if trim.mean() > upper.mean() else upper * 0.5)
-    _paint(out, _inside(c.y - ankle[1] + 0.006), (0.90, 0.90, 0.88) if style.leg < 1.5 else upper * 0.6)  # sock, collar
+    _paint(
+        out, _inside(c.y - ankle[1] + 0.006), (0.90, 0.90, 0.88) if style.leg < 1.5 else upper * 0.6
+    )  # sock, collar
     return out * _folds(c, style, 0.12)
 
 
@@ -531,35 +543,32 @@ def stand_off(body: Body, style: Style) -> Array:
     return distance[:, None] * direction
 
 
-def _neighbour_mean(faces: NDArray[np.integer], n: int):
+def _neighbour_mean(faces: NDArray[np.integer], n: int) -> csr_array:
     """[n, n] sparse matrix that replaces a value by the mean over the vertices an edge away."""
-    from scipy.sparse import coo_array, diags_array
-
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     edges = np.unique(np.sort(edges, 1), axis=0)
     i, j = np.concatenate([edges, edges[:, ::-1]]).T
     adjacent = coo_array((np.ones(len(i)), (i, j)), (n, n)).tocsr()
     degree = np.maximum(adjacent.sum(1), 1)
-    return diags_array(1 / degree) @ adjacent
+    return csr_array(diags_array(1 / degree) @ adjacent)
 
 
-def bake(
-    body: Body, style: Style, size: int = TEXTURE_SIZE
-) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+def bake(body: Body, style: Style, size: int = TEXTURE_SIZE) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Texture [S, S, 3] sRGB in [0, 1] and part labels [S, S] over the body's atlas; row 0 is v = 1.
 
     Texels outside every chart take the nearest chart's value, so bilinear look-ups at a seam do not bleed.
     """
-    from scipy.ndimage import distance_transform_edt
-
     corners = np.column_stack([body.uv[:, 0] * size, (1 - body.uv[:, 1]) * size, np.ones(len(body.uv))])
     raster = rasterize(corners, body.uv_faces, size, size)
     hit = raster.mask
     on_body = np.concatenate([body.v_template, limb_groups(body.weights)], 1)
-    values = raster.interpolate(on_body, body.faces)[hit].astype(np.float64)
+    corner, bary = body.faces[raster.face[hit]], raster.bary[hit].astype(np.float64)
+    values = np.zeros((len(corner), on_body.shape[1]))
+    for k in range(3):
+        values += bary[:, [k]] * on_body[corner[:, k]]
     chart = Chart(values[:, :3], values[:, 3:], body)
     texture = np.zeros((size, size, 3), np.float32)
     labels = np.zeros((size, size), np.uint8)
     texture[hit], labels[hit] = albedo(chart, style), part_labels(chart, style)
-    row, column = distance_transform_edt(~hit, return_distances=False, return_indices=True)
+    row, column = np.asarray(distance_transform_edt(~hit, return_distances=False, return_indices=True))
     return np.ascontiguousarray(texture[row, column]), np.ascontiguousarray(labels[row, column])

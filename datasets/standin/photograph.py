@@ -98,11 +98,17 @@ def _shade_kernel():
                         v += b * uv[uv_faces[f, k], 1]
                         for c in range(3):
                             normal[c] += b * normals[faces[f, k], c]
-                    normal /= np.sqrt((normal * normal).sum()) + 1e-12
-                    light[:] = ambient
+                    # scalar loops: array expressions would allocate for every sample
+                    length = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2) + 1e-12
+                    for c in range(3):
+                        light[c] = ambient[c]
                     for lamp in range(towards.shape[0]):
-                        half = 0.5 + 0.5 * (normal * towards[lamp]).sum()
-                        light += half * half * colours[lamp]
+                        facing = 0.0
+                        for c in range(3):
+                            facing += normal[c] / length * towards[lamp, c]
+                        half = 0.5 + 0.5 * facing
+                        for c in range(3):
+                            light[c] += half * half * colours[lamp, c]
                     # bilinear, texel centres at +0.5, row 0 is v = 1
                     x = min(max(u * size - 0.5, 0.0), size - 1.001)
                     y = min(max((1.0 - v) * size - 0.5, 0.0), size - 1.001)

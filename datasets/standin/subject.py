@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.body import Body
+from ihbench.camera import Camera
 from ihbench.datasets.standin import motion, outfit
 from ihbench.datasets.standin.lighting import Lighting, studio_lighting
 from ihbench.datasets.standin.rig import camera_ring
@@ -71,7 +72,7 @@ class Subject:
         return studio_lighting(self._rng("light"))
 
     @cached_property
-    def cameras(self):
+    def cameras(self) -> list[Camera]:
         """The calibrated rig of this person's session."""
         return camera_ring(self._rng("rig"))
 

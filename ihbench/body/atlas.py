@@ -1,11 +1,13 @@
 """Texture coordinates for any SMPL-shaped body that comes without: six cylinder charts, one per body part.
 
-Each part (torso, head, two arms, two legs) is unrolled about a line through its bones: u from the angle about the line,
-v from the length along it, both re-spaced so that texels cover about the same area everywhere. No chart is mirrored.
+Each part (torso, head, two arms, two legs) is unrolled about a line through its bones: u from the angle about the
+line, v from the length along it, both re-spaced so that texels cover about the same area everywhere. No chart is
+mirrored.
 """
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -31,7 +33,8 @@ PARTS = (
     Part((2, 5, 8, 11), (0.76, 0.01, 0.99, 0.49), limb=True),
 )
 ANGLE_BINS, LENGTH_BINS = 64, 48
-POLE = 0.4  # a corner this much nearer to the line than the face's farthest one sits at the tip of the part
+LENGTH_ROUNDS, ANGLE_ROUNDS = 8, 2  # of smoothing
+POLE = 0.8  # a corner whose neighbours' directions cancel to this fraction of the others' sits at the tip of a part
 
 
 def part_atlas(
@@ -82,36 +85,60 @@ def _axis(part: int, J: Array, top: float) -> tuple[Array, Array]:
     if part < 4:  # arm: angle 0 on top, seam below
         shoulder, elbow, wrist, hand = J[16 + right], J[18 + right], J[20 + right], J[22 + right]
         out = np.array([side, 0.0, 0.0])
-        return np.array([shoulder - 0.2 * out, shoulder, elbow, wrist, hand, hand + 0.25 * out]), np.array([0.0, 1, 0])
+        return np.array([shoulder - 0.2 * out, shoulder, elbow, wrist, hand, hand + 0.25 * out]), np.array(
+            [0.0, 1, 0]
+        )
     hip, knee, ankle, foot = J[1 + right], J[4 + right], J[7 + right], J[10 + right]  # angle 0 outside and in front
-    line = [hip + [0, 0.2, 0], hip, knee, ankle, ankle + [0, -0.03, 0.03], foot + [0, -0.005, 0], foot + [0, 0, 0.2]]
-    return np.array(line), np.array([0.8 * side, 0.0, 0.6])
+    above_hip, heel = hip + np.array([0, 0.2, 0]), ankle + np.array([0, -0.03, 0.03])
+    sole, beyond_toes = foot + np.array([0, -0.005, 0]), foot + np.array([0, 0, 0.2])
+    return np.array([above_hip, hip, knee, ankle, heel, sole, beyond_toes]), np.array([0.8 * side, 0.0, 0.6])
 
 
-def _unroll(vertices: Array, faces: NDArray[np.integer], line: Array, front: Array) -> tuple[Array, NDArray[np.int64]]:
+def _unroll(
+    vertices: Array, faces: NDArray[np.integer], line: Array, front: Array
+) -> tuple[Array, NDArray[np.int64]]:
     """uv [n, 2] in [0, 1] and the corners [F, 3] of one chart; vertices on the seam get two uv entries."""
-    corners = vertices[faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-    angle, length, radius = _cylinder_coordinates(corners.reshape(-1, 3), line, front)
-    face_angle, face_length, face_radius = _cylinder_coordinates(corners.mean(1), line, front)
-    angle, radius = angle.reshape(-1, 3), radius.reshape(-1, 3)
+    used, faces = np.unique(faces, return_inverse=True)
+    faces = faces.reshape(-1, 3)
+    points = vertices[used]
+    direction, length, radius = _cylinder_coordinates(points, line, front)
+    # where the line bends, every point of a wedge is nearest to the corner: without smoothing the heel has no length
+    length = _smoothed(length[:, None], faces, LENGTH_ROUNDS)[faces, 0]
+    direction = _smoothed(direction, faces, ANGLE_ROUNDS)[faces]  # [F, 3, 2] cosine and sine, shorter at the poles
+    face_direction = direction.mean(1)
+    face_angle = np.arctan2(face_direction[:, 1], face_direction[:, 0])
+    angle = np.arctan2(direction[..., 1], direction[..., 0])
     angle -= 2 * np.pi * np.round((angle - face_angle[:, None]) / (2 * np.pi))  # keep a face on one side of the seam
-    at_pole = radius < POLE * radius.max(1, keepdims=True)
-    angle = np.where(at_pole, face_angle[:, None], angle)  # near the line a vertex's own angle means nothing
+    strength = np.linalg.norm(direction, axis=-1)
+    at_pole = strength < POLE * strength.max(1, keepdims=True)
+    angle = np.where(at_pole, face_angle[:, None], angle)  # at the tip of a part a vertex has no angle of its own
     key = np.column_stack([faces.ravel(), np.round(angle.ravel(), 5)])
-    _, first, inverse = np.unique(key, axis=0, return_index=True, return_inverse=True)
-    angle, length = angle.ravel()[first], length[first]
-    u = np.interp(angle, *_by_area(angle, face_angle, area))
-    v = np.interp(length, *_by_area_over_radius(length, face_length, face_radius, area))
-    return np.column_stack([u, v]), inverse.reshape(-1, 3)
+    _, first, corners = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    a, b, c = (points[faces[:, k]] for k in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    u = np.interp(angle.ravel()[first], *_by_area(angle, face_angle, area))
+    v = np.interp(length.ravel()[first], *_by_area_over_radius(length, length.mean(1), radius[faces].mean(1), area))
+    return np.column_stack([u, v]), corners.reshape(-1, 3)
+
+
+def _smoothed(values: Array, faces: NDArray[np.integer], rounds: int) -> Array:
+    """[n, k] values at vertices, averaged with their neighbours' mean so many times."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    edges = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0)
+    degree = np.bincount(edges[:, 0])
+    for _ in range(rounds):
+        gathered = [np.bincount(edges[:, 0], column[edges[:, 1]]) / degree for column in values.T]
+        values = (values + np.stack(gathered, 1)) / 2
+    return values
 
 
 def _cylinder_coordinates(points: Array, line: Array, front: Array) -> tuple[Array, Array, Array]:
-    """Angle rad about the nearest segment of a line, arc length m along the line, and distance m to it; all [N]."""
+    """Cosine and sine [N, 2] of the angle about the nearest segment of a line, arc length [N] m along the line and
+    distance [N] m to it."""
     distance = np.full(len(points), np.inf)
-    angle, length = np.zeros(len(points)), np.zeros(len(points))
+    direction, length = np.zeros((len(points), 2)), np.zeros(len(points))
     before = 0.0
-    for start, end in zip(line[:-1], line[1:], strict=True):
+    for start, end in pairwise(line):
         span = float(np.linalg.norm(end - start))
         along = (end - start) / span
         h = np.clip((points - start) @ along, 0, span)
@@ -123,9 +150,10 @@ def _cylinder_coordinates(points: Array, line: Array, front: Array) -> tuple[Arr
         y = np.cross(along, x)
         distance[nearer] = here[nearer]
         length[nearer] = before + h[nearer]
-        angle[nearer] = np.arctan2(radial[nearer] @ y, radial[nearer] @ x)
+        across = np.column_stack([radial @ x, radial @ y])
+        direction[nearer] = (across / np.maximum(np.linalg.norm(across, axis=1), 1e-9)[:, None])[nearer]
         before += span
-    return angle, length, distance
+    return direction, length, distance
 
 
 def _by_area(angle: Array, face_angle: Array, area: Array) -> tuple[Array, Array]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, fields
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +16,22 @@ from ihbench.scene import BodyPose
 Array = NDArray[np.float64]
 
 
+@lru_cache(maxsize=16)  # one person is posed thousands of times in one shape
+def _shaped(body: Body, betas: bytes) -> tuple[Array, Array]:
+    coefficients = np.frombuffer(betas)
+    vertices = body.v_template + body.shapedirs[:, :, : len(coefficients)] @ coefficients
+    joints = body.J_regressor @ vertices
+    vertices.setflags(write=False)
+    joints.setflags(write=False)
+    return vertices, joints
+
+
 @dataclass(frozen=True, eq=False)
 class Body:
     """An SMPL-shaped body model in its T-pose: y up, facing +z, left hand at +x, metres.
 
-    Made by `load_body`, which checks every shape. Arrays are read-only; two bodies are equal only if they are the same
-    object, so a body can be a cache key. Compare contents with `content_sha`.
+    Made by `load_body`, which checks every shape. Arrays are read-only; two bodies are equal only if they are the
+    same object, so a body can be a cache key. Compare contents with `content_sha`.
     """
 
     v_template: Array  # [V, 3] m
@@ -50,7 +60,8 @@ class Body:
     ) -> tuple[Array, Array]:
         """Vertices [V, 3] m and joints [24, 3] m of the rest pose with the given shape coefficients.
 
-        Missing coefficients count as 0; surplus ones must be 0, else `BadInput`: dropping them would change the person.
+        Read-only arrays. Missing coefficients count as 0; surplus ones must be 0, else `BadInput`: dropping them would make it another
+        person.
         """
         betas = np.asarray(betas, np.float64).reshape(-1)
         known = self.shapedirs.shape[2]
@@ -59,9 +70,7 @@ class Body:
                 f"body {self.name!r} has {known} shape coefficients, the data gives {len(betas)} and those beyond "
                 f"{known} are not 0; load a body file with more coefficients"
             )
-        betas = betas[:known]
-        vertices = self.v_template + self.shapedirs[:, :, : len(betas)] @ betas
-        return vertices, self.J_regressor @ vertices
+        return _shaped(self, betas[:known].tobytes())
 
     def joint_transforms(self, body_pose: BodyPose) -> Array:
         """[24, 4, 4] transforms that take points of the shaped T-pose to the posed world, translation included."""

@@ -1,7 +1,7 @@
 """ZJU-MoCap's root (Rh, Th) and SMPL's own root, converted both ways.
 
-SMPL turns the body about joint 0 and then moves it: v = R(theta_0) (v0 - J0) + J0 + t. ZJU-MoCap poses the body with a
-zero root and then moves it about the model's origin: v = R(Rh) v0 + Th. Hence Rh = theta_0 and Th = t + J0 - R J0.
+SMPL turns the body about joint 0 and then moves it: v = R(theta_0) (v0 - J0) + J0 + t. ZJU-MoCap poses the body with
+a zero root and then moves it about the model's origin: v = R(Rh) v0 + Th. Hence Rh = theta_0 and Th = t + J0 - R J0.
 Source: zju3dv/neuralbody zju_smpl/smplmodel/body_model.py.
 """
 

@@ -36,8 +36,8 @@ PARENTS: tuple[int, ...] = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13
 
 JOINT_INDEX: dict[str, int] = {name: index for index, name in enumerate(JOINT_NAMES)}
 
-# [24, 3] RGB, one per joint, at least 37 apart in CIELAB and never grey: the colours of every part map. Fixed for good:
-# models trained on part maps depend on them.
+# [24, 3] RGB, one per joint, at least 37 apart in CIELAB and never grey: the colours of every part map. Fixed for
+# good: models trained on part maps depend on them.
 PART_PALETTE: NDArray[np.uint8] = np.array(
     [
         (102, 102, 153),

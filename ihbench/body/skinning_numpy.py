@@ -57,7 +57,7 @@ def lbs(
     transforms: Array,  # [24, 4, 4]
 ) -> Array:
     """[N, 3] m: every point moved by its own weighted mean of the joint transforms."""
-    blended = np.einsum("nk,kab->nab", weights, transforms[:, :3])
+    blended = np.tensordot(weights, transforms[:, :3], 1)  # [N, 3, 4]
     return np.einsum("nab,nb->na", blended[:, :, :3], points) + blended[:, :, 3]
 
 

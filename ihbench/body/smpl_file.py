@@ -1,4 +1,4 @@
-"""Read body model files without running anything in them: the official SMPL `.pkl` and `.npz`, and this bench's `.npz`.
+"""Read body model files without running anything in them: SMPL's official `.pkl` and `.npz`, and the bench's `.npz`.
 
 The official files are gated and never shipped or downloaded. Facts about their contents follow
 vchoutas/smplx smplx/body_models.py and SMPL's release notes.
@@ -23,7 +23,9 @@ from ihbench.errors import BadInput
 from ihbench.safe_pickle import ForeignObject, load_pickle
 
 PROCEDURAL_FILE = Path(__file__).with_name("procedural_body.npz")
-WHERE_SMPL_IS = "register at https://smpl.is.tue.mpg.de, download SMPL for Python and give the .pkl file or its folder"
+WHERE_SMPL_IS = (
+    "register at https://smpl.is.tue.mpg.de, download SMPL for Python and give the .pkl file or its folder"
+)
 REQUIRED = ("v_template", "f", "weights", "J_regressor", "kintree_table", "shapedirs")
 OPTIONAL = ("posedirs", "vt", "ft", "face_landmarks")
 MAX_ELEMENTS = 10**9  # of one array; a real file's largest has 6.2 million (300 shape coefficients)
@@ -74,7 +76,9 @@ def find_model_file(folder: Path, gender: str = "neutral") -> Path:
             found = sorted(file for file in place.iterdir() if name.fullmatch(file.name))
             if found:
                 return found[0]
-    raise BadInput(f"{folder}: no SMPL_{gender.upper()}.pkl, .npz or basicModel_{gender[0]}_lbs_*.pkl; {WHERE_SMPL_IS}")
+    raise BadInput(
+        f"{folder}: no SMPL_{gender.upper()}.pkl, .npz or basicModel_{gender[0]}_lbs_*.pkl; {WHERE_SMPL_IS}"
+    )
 
 
 def read_arrays(path: Path) -> dict[str, Any]:
@@ -111,10 +115,10 @@ def _plain_array(value: Any, where: str) -> NDArray:
             return _foreign_array(value, where)
         except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
             raise BadInput(f"{where}: a damaged {value.kind} object ({error!r}); copy the file again") from None
-    array = np.asarray(value)
-    if array.dtype.kind not in "biuf":
-        raise BadInput(f"{where}: expected numbers, found {array.dtype}")
-    return array
+    if not isinstance(value, np.ndarray) or value.dtype.kind not in "biuf":
+        kind = value.dtype if isinstance(value, np.ndarray) else type(value).__name__
+        raise BadInput(f"{where}: expected an array of numbers, found {kind}")
+    return value
 
 
 def _foreign_array(value: ForeignObject, where: str) -> NDArray:
@@ -188,6 +192,7 @@ def check_arrays(arrays: dict[str, Any], path: Path) -> None:
             "this is not SMPL (SMPL-H and SMPL-X have 52 and 55 joints); give an SMPL file"
         )
     expected: dict[str, tuple[int | None, ...]] = {
+        "kintree_table": (2, 24),
         "v_template": (V, 3),
         "f": (F, 3),
         "weights": (V, 24),

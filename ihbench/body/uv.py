@@ -135,7 +135,7 @@ def chart_padding(
     index = np.full(mask.shape, -1, np.int64)
     if not mask.any():
         return index
-    near = distance_transform_cdt(~mask, metric="chessboard") <= texels
-    row, column = distance_transform_edt(~mask, return_distances=False, return_indices=True)
+    near = np.asarray(distance_transform_cdt(~mask, metric="chessboard")) <= texels
+    row, column = np.asarray(distance_transform_edt(~mask, return_distances=False, return_indices=True))
     index[near] = (row * mask.shape[1] + column)[near]
     return index

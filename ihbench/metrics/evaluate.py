@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ihbench.errors import BadInput
 from ihbench.metrics.identity import Identity, Score, background_part
 from ihbench.metrics.psnr import check_images, peak_of, pooled_psnr, squared_error
-from ihbench.metrics.ssim import Scratch, differing_pixels, mean_ssim
+from ihbench.metrics.ssim import differing_pixels, mean_ssim
 
 Color = tuple[float, float, float]
 Region = NDArray[np.bool_] | str | None  # a mask [H, W], the reason why there is none, or the whole frame
@@ -35,10 +35,6 @@ class Frame:
     @cached_property
     def differs(self) -> NDArray[np.bool_]:
         return differing_pixels(self.pred, self.truth)  # [H, W]
-
-    @cached_property
-    def scratch(self) -> Scratch:
-        return Scratch()
 
 
 @dataclass(frozen=True)
@@ -112,7 +108,7 @@ def round_both_to_8bit(pred: NDArray, truth: NDArray) -> tuple[NDArray, NDArray]
             image = np.rint(np.clip(np.where(np.isfinite(image), image, np.nan), 0, 1) * 255)
         rounded.append(image)
     if any(image.dtype != np.uint8 and np.isnan(image).any() for image in rounded):
-        return rounded[0] / 255.0, rounded[1] / 255.0
+        return rounded[0].astype(np.float64) / 255, rounded[1].astype(np.float64) / 255
     return rounded[0].astype(np.uint8), rounded[1].astype(np.uint8)
 
 
@@ -129,8 +125,7 @@ def _psnr(frame: Frame, mask: NDArray[np.bool_] | None) -> float:
 
 
 def _ssim(frame: Frame, mask: NDArray[np.bool_] | None) -> float:
-    images = frame.pred, frame.truth, frame.differs
-    return mean_ssim(*images, mask, background=frame.background, scratch=frame.scratch)
+    return mean_ssim(frame.pred, frame.truth, frame.differs, mask, background=frame.background)
 
 
 def _psnr_identity(region: str, background: Color) -> Identity:

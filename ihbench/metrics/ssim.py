@@ -60,10 +60,8 @@ def mean_ssim(
     sigma: float = 1.5,
     data_range: float = 1.0,
     background: float | tuple[float, ...] = 1.0,
-    scratch: Scratch | None = None,
 ) -> float:
     """`ssim` for images already checked."""
-    scratch = scratch or Scratch()
     channels = pred.shape[2] if pred.ndim == 3 else 1
     pixels = differs.size if mask is None else int(np.count_nonzero(mask))
     if pixels * channels == 0:
@@ -74,7 +72,7 @@ def mean_ssim(
     for rows, columns, outer_rows, outer_columns in _windows_to_do(differs, mask, window // 2):
         inside = None if mask is None else mask[outer_rows, outer_columns]
         x, y = pred[outer_rows, outer_columns], truth[outer_rows, outer_columns]
-        values = _ssim_of(x, y, inside, window, sigma, data_range, background, scratch)
+        values = _ssim_of(x, y, inside, window, sigma, data_range, background)
         weights = np.zeros(values.shape[:2])  # selecting pixels by a product is ten times faster than by index
         within = _within(rows, outer_rows), _within(columns, outer_columns)
         weights[within] = 1.0 if inside is None else inside[within]
@@ -93,10 +91,10 @@ def ssim_map(
     """SSIM at every pixel and channel, with the images' shape. Raises `ValueError` as `ssim` does."""
     check_images(pred, truth)
     check_window(window, sigma)
-    out, scratch = np.ones(pred.shape), Scratch()
+    out = np.ones(pred.shape)
     for rows, columns, outer_rows, outer_columns in _windows_to_do(differing_pixels(pred, truth), None, window // 2):
         x, y = pred[outer_rows, outer_columns], truth[outer_rows, outer_columns]
-        values = _ssim_of(x, y, None, window, sigma, data_range, 0.0, scratch)
+        values = _ssim_of(x, y, None, window, sigma, data_range, 0.0)
         out[rows, columns] = values[_within(rows, outer_rows), _within(columns, outer_columns)]
     return out
 
@@ -114,20 +112,6 @@ def check_window(window: int, sigma: float) -> None:
         raise ValueError(f"ssim window: expected an odd size and sigma > 0, got window={window}, sigma={sigma}")
 
 
-class Scratch:
-    """Float64 buffers used again from band to band: fresh pages for every temporary cost more than the arithmetic."""
-
-    def __init__(self) -> None:
-        self._buffers: dict[str, NDArray[np.float64]] = {}
-
-    def take(self, name: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
-        """The buffer of that name as an uninitialised array; what it held before is gone."""
-        size = math.prod(shape)
-        if name not in self._buffers or self._buffers[name].size < size:
-            self._buffers[name] = np.empty(size)
-        return self._buffers[name][:size].reshape(shape)
-
-
 def _ssim_of(
     pred: NDArray,  # [h, w, C] or [h, w]
     truth: NDArray,
@@ -136,14 +120,13 @@ def _ssim_of(
     sigma: float,
     data_range: float,
     background: float | tuple[float, ...],
-    scratch: Scratch,
 ) -> NDArray[np.float64]:
-    """The SSIM map of two images, painted outside `inside` and mirrored at their edges; valid until the next call."""
+    """The SSIM map of two images, painted outside `inside` and mirrored at their edges."""
     import cv2
 
     peak = 255.0 if pred.dtype == np.uint8 else 1.0
     shape = pred.shape
-    s, d = scratch.take("s", shape), scratch.take("d", shape)
+    s, d = np.empty(shape), np.empty(shape)
     with np.errstate(invalid="ignore", over="ignore"):  # a NaN or infinite pixel becomes NaN, not a warning
         if pred.dtype == np.uint8:
             pred, truth = pred.astype(np.int16), truth.astype(np.int16)
@@ -159,15 +142,15 @@ def _ssim_of(
 
         weights = gaussian_window(window, sigma)
 
-        def filtered(image: NDArray, name: str) -> NDArray:
-            out = scratch.take(name, shape)
+        def filtered(image: NDArray) -> NDArray:
+            out = np.empty(shape)  # given, because cv2 would drop a channel axis of length 1
             cv2.sepFilter2D(image, cv2.CV_64F, weights, weights, dst=out, borderType=cv2.BORDER_REFLECT)
             return out
 
-        mean_s, mean_d = filtered(s, "mean_s"), filtered(d, "mean_d")
+        mean_s, mean_d = filtered(s), filtered(d)
         s *= s
         d *= d
-        var_s, var_d = filtered(s, "var_s"), filtered(d, "var_d")
+        var_s, var_d = filtered(s), filtered(d)
         mean_s *= mean_s
         mean_d *= mean_d
         var_s -= mean_s

@@ -1,11 +1,12 @@
-"""Isotropic Gaussian splatting: one function, three back ends that agree (float64 torch, numba on the CPU, gsplat on CUDA).
+"""Isotropic Gaussian splatting: one function, three back ends that agree (float64 torch, numba on the CPU, gsplat).
 
 The Gaussians are the paper's: a centre, one scale, a colour, opacity 1. What every back end draws is defined here:
 
 - Projection: `p = R x + t`; depth `z = p_z`; centre `u = K p / z` with pixel centres at +0.5; footprint variance
   `(f s / z)^2 + LOW_PASS` px² with `f = sqrt(fx fy)`.
-- At distance d px from its centre a splat has alpha `min(ALPHA_MAX, exp(-d² / (2 variance)))`; below `ALPHA_MIN` it is
-  dropped. The constants are those of 3D Gaussian splatting (Kerbl et al. 2023, released code) as `gsplat` has them.
+- At distance d px from its centre a splat has alpha `min(ALPHA_MAX, exp(-d² / (2 variance)))`; below `ALPHA_MIN` it
+  is dropped. The constants are those of 3D Gaussian splatting (Kerbl et al. 2023, released code) as `gsplat` has
+  them.
 - Splats are composited front to back in the order of their depth, compared as float32; equal depths keep the order of
   their index. What is left of the transmittance shows the background.
 """
@@ -55,8 +56,8 @@ def render_gaussians(
     `backend`: "reference" is the float64 twin (slow, any device), "numba" the CPU, "gsplat" CUDA (the `cuda` extra),
     "auto" gsplat for CUDA tensors and numba otherwise (the reference where numba is not installed).
 
-    A Gaussian with a value that is NaN or infinite, or that leaves float32 when projected, is not drawn and gets a zero
-    gradient: one bad Gaussian must not blacken the picture, and whoever trains checks the parameters for finiteness.
+    A Gaussian with a value that is NaN or infinite, or that leaves float32 when projected, is not drawn and gets a
+    zero gradient: one bad Gaussian must not blacken the picture. Whoever trains checks the parameters for finiteness.
 
     Raises ValueError for a camera with lens distortion (undistort the image, use `camera.undistorted()`), for wrong
     shapes and for an unknown back end; ImportError or RuntimeError where the asked-for back end cannot run here.
@@ -81,10 +82,9 @@ def project_gaussians(means: Tensor, scales: Tensor, colors: Tensor, camera: Cam
     depth is the same in every back end.
     """
     splats = _project(means, scales, colors, camera)
-    drawable = _drawable(splats)
-    if not drawable.all():
+    if not _all_drawable(splats):
         # projected anew without the bad ones: masking afterwards would still send NaN through the backward pass
-        keep = drawable.nonzero()[:, 0]
+        keep = _drawable(splats).nonzero()[:, 0]
         splats = _project(means[keep], scales[keep], colors[keep], camera)
     return splats
 
@@ -94,17 +94,28 @@ def _project(means: Tensor, scales: Tensor, colors: Tensor, camera: Camera) -> S
     K[2, 2] = 1.0
     to_pixels = torch.from_numpy((K @ camera.R).T).to(means.device)
     p = torch.addmm(torch.from_numpy(K @ camera.t).to(means.device), means.double(), to_pixels)
-    z = p[:, 2]
-    variance = K[0, 0] * K[1, 1] * (scales.double() / z).square() + LOW_PASS
-    return Splats(p[:, :2] / z[:, None], variance, z.detach().float(), colors)
+    xy, z = p.split((2, 1), 1)
+    variance = (scales.double()[:, None] / z).square() * (K[0, 0] * K[1, 1]) + LOW_PASS
+    return Splats(xy / z, variance[:, 0], z.detach()[:, 0].float(), colors)
 
 
 @torch.no_grad()
 def _drawable(splats: Splats) -> Tensor:
     """[N] bool: in front of the near plane, and every value finite in float32."""
-    # the sum of a row is finite if and only if its values are, short of an overflow that is as bad
-    total = splats.xy.float().sum(1) + splats.variance.float() + splats.depth + splats.colors.float().sum(1)
-    return total.isfinite() & (splats.depth > NEAR)
+    finite = splats.xy.float().isfinite().all(1) & splats.variance.float().isfinite()
+    return finite & splats.colors.float().isfinite().all(1) & (splats.depth > NEAR) & splats.depth.isfinite()
+
+
+@torch.no_grad()
+def _all_drawable(splats: Splats) -> bool:
+    """Whether `_drawable` holds for all, from four sums; False may also mean that a sum of finite values overflowed.
+
+    A fast way out of the common case, in which nothing is wrong.
+    """
+    if len(splats.depth) == 0:
+        return True
+    total = splats.xy.float().sum() + splats.variance.float().sum() + splats.colors.float().sum() + splats.depth.sum()
+    return bool(total.isfinite() & (splats.depth.min() > NEAR))
 
 
 def _check(
@@ -112,7 +123,9 @@ def _check(
 ) -> Tensor:
     """Raise ValueError for what cannot be drawn; the background as [C] in the dtype and on the device of `means`."""
     if camera.distortion is not None:
-        raise ValueError("splat camera: expected no lens distortion; undistort the image and use camera.undistorted()")
+        raise ValueError(
+            "splat camera: expected no lens distortion; undistort the image and use camera.undistorted()"
+        )
     n = len(means)
     if means.shape != (n, 3) or scales.shape != (n,) or colors.ndim != 2 or len(colors) != n or colors.shape[1] < 1:
         raise ValueError(

@@ -1,28 +1,31 @@
 """The splat renderer on the CPU: numba, 16×16 px tiles, analytic backward pass, every core.
 
-Three facts make it fast. An isotropic footprint is separable, so a splat costs 32 exponentials per tile instead of 256.
-A tile row has 16 pixels, one 512-bit register: every row is drawn whole, without a branch, and columns outside the
-footprint fall under the alpha threshold. And opacity is 1, so a tile saturates after a few layers and the rest of its
-list is never looked at.
+Three facts make it fast. An isotropic footprint is separable, so a splat costs 32 exponentials per tile instead of
+256. A tile row has 16 pixels, one 512-bit register: every row is drawn whole, without a branch, and columns outside
+the footprint fall under the alpha threshold. And opacity is 1, so a tile saturates after a few layers and the rest of
+its list is never looked at.
 
 The backward pass needs no division and no subtraction of large sums. With T_k the transmittance in front of splat k,
-g the gradient of a pixel and `seen_k` = g · (the colour composited from everything behind k, as if k were not there):
+g the gradient of a pixel and `seen_k` = g · (the colour composited from everything behind k, as if alone):
 
     dL/d alpha_k = T_k (g · c_k - seen_k),     seen_{k-1} = seen_k + alpha_k (g · c_k - seen_k),
 
 which is a back-to-front compositing and stays accurate where 1 - alpha is 1/1000. T_k is recomputed front to back in
 chunks of `CHUNK` splats from the transmittances that the forward pass stored at the start of every chunk.
 
-Early stop: rows of pixels are left alone, at the granularity of a chunk, once no pixel above or below lets through
-`T_STOP`. What is cut off changes a colour by less than T_STOP times the range of colours.
+Early stop: at the start of a chunk the outer rows of a tile in which no pixel lets through `T_STOP` are left out of
+it, and the tile ends when all are. That changes a colour by less than T_STOP times the range of colours, and the
+gradient of an alpha by less than T_STOP / (1 - alpha) times that range.
 
-Nothing depends on the number of threads: a tile's list is in depth order however it was filled, and the gradients of a
-splat are added up tile after tile.
+Nothing depends on the number of threads: a tile's list is in depth order however it was filled, and the gradients of
+a splat are added up tile after tile.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -34,16 +37,21 @@ from ihbench.render.splat import ALPHA_MAX, ALPHA_MIN, Splats
 
 TILE = 16  # px
 CHUNK = 32  # splats between two stored transmittances
-T_STOP = 1e-5
+T_STOP = 1e-5  # a transmittance below it counts as none
+SHARES = 8  # parts of the splats that are binned side by side; fixed, so that the threads cannot change the lists
 CHANNELS = 3  # colour channels of one pass; other counts are drawn in several
 
 f32 = np.float32
-# Loop bounds and offsets are unsigned so that numba leaves out its test for negative indices, which would hide from the
-# compiler that the accesses of a row are consecutive.
+# Two things keep the loops over a row vector instructions. Offsets and bounds are unsigned, so that numba leaves out
+# its test for negative indices, which hides that the accesses are consecutive. And where the body is small, the number
+# of lanes is an argument: a constant would make LLVM unroll the loop into scalars before it looks for vectors.
 u64 = np.uint64
 LANES = u64(TILE)
+AREA = u64(TILE * TILE)
 ROW = u64(4 * TILE)  # one tile row of four interleaved planes
 PLANE_1, PLANE_2, PLANE_3, PLANE_4, PLANE_5 = (u64(k * TILE) for k in range(1, 6))
+LOG_CUTOFF = 2 * math.log(1 / ALPHA_MIN)  # reach² / variance
+LOG2_E = math.log2(math.e)
 SPLAT = 8  # floats of a packed splat: x, y, sharpness, reach², colour, padding
 GRADIENT = 6  # floats of a gradient entry: sums over dx, dy, d², colour
 
@@ -58,76 +66,84 @@ def composite(
     background: Tensor,  # [C]
 ) -> tuple[Tensor, Tensor]:
     """Splats -> rgb [H, W, C], alpha [H, W], float32. `Splats` and the conventions: `ihbench.render.splat`."""
-    channels = splats.colors.shape[1]
-    images, alpha = [], None
-    for start in range(0, channels, CHANNELS):
-        colors = splats.colors[:, start : start + CHANNELS]
-        bg = background[start : start + CHANNELS]
-        missing = CHANNELS - colors.shape[1]
-        if missing:
-            colors = torch.nn.functional.pad(colors, (0, missing))
-            bg = torch.nn.functional.pad(bg, (0, missing))
-        rgb, group_alpha = _Composite.apply(splats.xy, splats.variance, colors, splats.depth, height, width, bg)
-        images.append(rgb[..., : CHANNELS - missing] if missing else rgb)
-        alpha = group_alpha if alpha is None else alpha
-    return (images[0] if len(images) == 1 else torch.cat(images, -1)), alpha
+    xy, variance, depth, colors = splats.xy, splats.variance, splats.depth, splats.colors
+    # autograd switches the grad mode off inside a Function, so whether to keep anything is decided here
+    keep = torch.is_grad_enabled() and (xy.requires_grad or variance.requires_grad or colors.requires_grad)
+    channels = colors.shape[1]
+    if channels == CHANNELS:
+        return _composite(xy, variance, colors, depth, height, width, background, keep)
+    padding = (0, -channels % CHANNELS)
+    groups = [
+        _composite(xy, variance, c, depth, height, width, bg, keep)
+        for c, bg in zip(
+            torch.nn.functional.pad(colors, padding).split(CHANNELS, 1),
+            torch.nn.functional.pad(background, padding).split(CHANNELS),
+            strict=True,
+        )
+    ]
+    return torch.cat([rgb for rgb, _ in groups], -1)[..., :channels], groups[0][1]
 
 
 class _Composite(torch.autograd.Function):
     """xy [M, 2], variance [M], colors [M, 3] -> rgb [H, W, 3], alpha [H, W]."""
 
     @staticmethod
-    def forward(ctx, xy, variance, colors, depth, height, width, background):
-        needs_gradient = any(ctx.needs_input_grad)
+    def forward(ctx: Any, xy, variance, colors, depth, height, width, background, keep) -> Any:
         xy, variance = xy.detach().double().contiguous().numpy(), variance.detach().double().contiguous().numpy()
         colors = colors.detach().float().contiguous().numpy()
         depth = depth.detach().float().contiguous().numpy()
         background = background.float().contiguous().numpy()
         workers = get_num_threads()
 
-        order = _depth_order(xy, variance, depth.view(np.uint32), height, width, _LOG_CUTOFF)
-        packed = _pack(xy, variance, colors, order, _LOG_CUTOFF)
-        counts = _count_tiles(packed, height, width, workers)
-        tile_start, splat_start, fill_at = _offsets(*counts)
-        if tile_start[-1] > np.iinfo(np.int32).max:
-            raise MemoryError(f"splats: {tile_start[-1]} pairs of splat and tile, more than this back end can index")
-        ranks, slots = _fill_tiles(packed, splat_start, fill_at, tile_start[-1], height, width, workers)
+        order = _depth_order(xy, variance, depth.view(np.uint32), height, width, LOG_CUTOFF)
+        packed = _pack(xy, variance, colors, order, LOG_CUTOFF)
+        tiles = -(-height // TILE) * -(-width // TILE)
+        cursor, splat_start = np.zeros((SHARES, tiles), np.int64), np.zeros(len(order) + 1, np.int64)
+        nothing = np.empty((0, SPLAT), f32), np.empty(0, np.int32)
+        _bin(packed, height, width, ALPHA_MIN, ALPHA_MAX, T_STOP, False, cursor, splat_start, *nothing)
+        tile_start, chunk_start = _offsets(cursor, splat_start)
+        total = tile_start[-1]
+        if total > np.iinfo(np.int32).max:
+            raise MemoryError(f"splats: {total} pairs of splat and tile, more than this back end can index")
+        entries, positions = np.empty((total, SPLAT), f32), np.empty(total, np.int32)
+        _bin(packed, height, width, ALPHA_MIN, ALPHA_MAX, T_STOP, True, cursor, splat_start, entries, positions)
 
         rgb, alpha = torch.empty(height, width, CHANNELS), torch.empty(height, width)
-        chunk_start = _chunk_offsets(tile_start)
-        stored = np.empty((chunk_start[-1] if needs_gradient else 0, TILE * TILE), f32)
+        stored = np.empty((chunk_start[-1] if keep else 0, TILE * TILE), f32)
         stop = _draw(
-            packed, ranks, tile_start, chunk_start, background, f32(ALPHA_MIN), f32(ALPHA_MAX), f32(T_STOP),
-            needs_gradient, stored, rgb.numpy(), alpha.numpy(), workers,
+            entries, tile_start, chunk_start, background, f32(ALPHA_MIN), f32(ALPHA_MAX), f32(T_STOP),
+            LANES, keep, stored, rgb.numpy(), alpha.numpy(), workers,
         )  # fmt: skip
-        if needs_gradient:
+        if keep:
             ctx.saved = (
-                packed, order, ranks, slots, tile_start, splat_start, chunk_start, stored, stop, background, variance
+                order, entries, positions, tile_start, splat_start, chunk_start, stored, stop, background, variance
             )  # fmt: skip
         return rgb, alpha
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, grad_rgb, grad_alpha):
-        packed, order, ranks, slots, tile_start, splat_start, chunk_start, stored, stop, background, variance = ctx.saved
+    def backward(ctx: Any, *grad_outputs: Any) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        grad_rgb, grad_alpha = grad_outputs
+        order, entries, positions, tile_start, splat_start, chunk_start, stored, stop, background, variance = (
+            ctx.saved
+        )
         grad_rgb, grad_alpha = grad_rgb.float().contiguous().numpy(), grad_alpha.float().contiguous().numpy()
         workers = get_num_threads()
-        entries = _draw_backward(
-            packed, ranks, slots, tile_start, chunk_start, stored, stop, background, grad_rgb, grad_alpha,
-            f32(ALPHA_MIN), f32(ALPHA_MAX), f32(T_STOP), workers,
+        gradients = _draw_backward(
+            entries, tile_start, chunk_start, stored, stop, background, grad_rgb, grad_alpha,
+            f32(ALPHA_MIN), f32(ALPHA_MAX), f32(T_STOP), LANES, workers,
         )  # fmt: skip
-        grad_xy, grad_variance, grad_colors = _sum_gradients(entries, order, splat_start, variance)
+        grad_xy, grad_variance, grad_colors = _sum_gradients(gradients, positions, order, splat_start, variance)
         return (
             torch.from_numpy(grad_xy), torch.from_numpy(grad_variance), torch.from_numpy(grad_colors),
-            None, None, None, None,
+            None, None, None, None, None,
         )  # fmt: skip
 
 
-_LOG_CUTOFF = 2 * math.log(1 / ALPHA_MIN)  # reach² / variance
-_LOG2_E = math.log2(math.e)
+_composite: Callable[..., tuple[Tensor, Tensor]] = _Composite.apply
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------
 # Depth order and packing
 
 
@@ -191,7 +207,7 @@ def _pack(xy, variance, colors, order, log_cutoff):
         i = order[rank]
         packed[rank, 0] = xy[i, 0]
         packed[rank, 1] = xy[i, 1]
-        packed[rank, 2] = math.sqrt(_LOG2_E / (2 * variance[i]))
+        packed[rank, 2] = math.sqrt(LOG2_E / (2 * variance[i]))
         packed[rank, 3] = min(variance[i] * log_cutoff, 1e37)
         packed[rank, 4] = colors[i, 0]
         packed[rank, 5] = colors[i, 1]
@@ -200,108 +216,100 @@ def _pack(xy, variance, colors, order, log_cutoff):
     return packed
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------
 # Lists of splats per tile
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, forceinline=True)
 def _band(center, half, size):
-    """First and one past the last tile of `size` pixels whose pixel centres come within `half` px of `center`."""
+    """First and one past the last tile of an axis of `size` px with a pixel centre within `half` px of `center`."""
     tiles = (size + TILE - 1) // TILE
     first = math.ceil((center - half - (TILE - 0.5)) / TILE)
     last = math.floor((center + half - 0.5) / TILE)
     return int(min(max(first, 0.0), tiles)), int(min(max(last, -1.0), tiles - 1)) + 1
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _half_width(y, reach_squared, tile_row):
-    """Half the width of a circle where it is widest within a row of tiles; -1 where it does not come there."""
-    top = tile_row * TILE + 0.5
-    dy = max(top - y, y - (top + TILE - 1), 0.0)
-    rest = reach_squared - dy * dy
-    return math.sqrt(rest) if rest >= 0 else -1.0
-
-
 @njit(cache=True, nogil=True, parallel=True)
-def _count_tiles(packed, height, width, workers):
-    """How many entries each worker's share of the splats has in each tile, and how many tiles each splat touches."""
-    m = len(packed)
-    tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
-    per_tile = np.zeros((workers, tiles_x * tiles_y), np.int64)
-    per_splat = np.empty(m, np.int64)
-    for w in prange(workers):
-        for rank in range(m * w // workers, m * (w + 1) // workers):
-            x, y, reach_squared = float(packed[rank, 0]), float(packed[rank, 1]), float(packed[rank, 3]) * 1.0001
-            y0, y1 = _band(y, math.sqrt(reach_squared), height)
-            touched = 0
-            for ty in range(y0, y1):
-                half = _half_width(y, reach_squared, ty)
-                if half >= 0:
-                    x0, x1 = _band(x, half, width)
-                    for tx in range(x0, x1):
-                        per_tile[w, ty * tiles_x + tx] += 1
-                    touched += max(x1 - x0, 0)
-            per_splat[rank] = touched
-    return per_tile, per_splat
+def _bin(packed, height, width, alpha_min, alpha_max, t_stop, fill, cursor, splat_start, entries, positions):
+    """Visit every (splat, tile) pair whose circle reaches a pixel centre of the tile.
 
+    First call (`fill` false): counts the pairs into `cursor` [SHARES, tiles] and `splat_start` [M + 1]. Second call:
+    with both turned into offsets by `_offsets`, writes the tiles' lists `entries` [E, SPLAT] and, splat by splat,
+    where its entries lie, `positions` [E].
 
-@njit(cache=True, nogil=True)
-def _offsets(per_tile, per_splat):
-    """Where each tile's list starts, where each splat's gradients start, where each worker writes in each tile."""
-    workers, tiles = per_tile.shape
-    tile_start = np.empty(tiles + 1, np.int64)
-    fill_at = np.empty((workers, tiles), np.int64)
-    total = 0
-    for t in range(tiles):
-        tile_start[t] = total
-        for w in range(workers):
-            fill_at[w, t] = total
-            total += per_tile[w, t]
-    tile_start[tiles] = total
-    splat_start = np.empty(len(per_splat) + 1, np.int64)
-    splat_start[0] = 0
-    for rank in range(len(per_splat)):
-        splat_start[rank + 1] = splat_start[rank] + per_splat[rank]
-    return tile_start, splat_start, fill_at
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _fill_tiles(packed, splat_start, fill_at, total, height, width, workers):
-    """The tiles' lists: per entry the rank of its splat, and the slot of its gradients, which lie splat by splat."""
+    The lists hold copies of the splats, because a tile reads its list in order and looking the splats up instead
+    would miss the cache at every one. A pair is left out where splats in front that cover the whole tile let through
+    less than `t_stop`; without that, a few thousand huge splats would fill the memory.
+    """
     m = len(packed)
     tiles_x = (width + TILE - 1) // TILE
-    ranks = np.empty(total, np.int32)
-    slots = np.empty(total, np.int32)
-    for w in prange(workers):
-        for rank in range(m * w // workers, m * (w + 1) // workers):
+    for share in prange(SHARES):
+        let_through = np.ones(cursor.shape[1], np.float32)  # at most, per tile, by this share's splats so far
+        for rank in range(m * share // SHARES, m * (share + 1) // SHARES):
+            # float32 rounding of the reach must not lose a pixel: the alpha threshold decides in the end
             x, y, reach_squared = float(packed[rank, 0]), float(packed[rank, 1]), float(packed[rank, 3]) * 1.0001
-            y0, y1 = _band(y, math.sqrt(reach_squared), height)
-            slot = splat_start[rank]
+            reach = math.sqrt(reach_squared)
+            covers = reach > 4 * TILE  # a smaller splat hides no tile
+            y0, y1 = _band(y, reach, height)
+            touched = 0
             for ty in range(y0, y1):
-                half = _half_width(y, reach_squared, ty)
-                if half >= 0:
-                    x0, x1 = _band(x, half, width)
-                    for tx in range(x0, x1):
-                        t = ty * tiles_x + tx
-                        at = fill_at[w, t]
-                        fill_at[w, t] = at + 1
-                        ranks[at] = rank
-                        slots[at] = slot
-                        slot += 1
-    return ranks, slots
+                top = ty * TILE + 0.5
+                dy = max(top - y, y - (top + TILE - 1), 0.0)
+                half = reach
+                if dy > 0:
+                    half = math.sqrt(max(reach_squared - dy * dy, 0.0))
+                x0, x1 = _band(x, half, width)
+                for tx in range(x0, x1):
+                    t = ty * tiles_x + tx
+                    if let_through[t] < t_stop:
+                        continue
+                    if covers:
+                        left = tx * TILE + 0.5
+                        far_x, far_y = max(x - left, left + TILE - 1 - x), max(y - top, top + TILE - 1 - y)
+                        exponent = (far_x * far_x + far_y * far_y) * float(packed[rank, 2]) ** 2
+                        least = math.exp(-exponent / LOG2_E)  # alpha in the corner that is farthest away
+                        if least > 2 * alpha_min:
+                            let_through[t] *= max(1 - least, 1 - alpha_max)
+                    at = cursor[share, t]
+                    cursor[share, t] = at + 1
+                    if fill:
+                        for k in range(SPLAT):
+                            entries[at, k] = packed[rank, k]
+                        positions[splat_start[rank] + touched] = at
+                    touched += 1
+            if not fill:
+                splat_start[rank] = touched
 
 
 @njit(cache=True, nogil=True)
-def _chunk_offsets(tile_start):
-    """Index of each tile's first stored transmittance."""
-    chunk_start = np.empty_like(tile_start)
-    chunk_start[0] = 0
-    for t in range(len(tile_start) - 1):
-        chunk_start[t + 1] = chunk_start[t] + (tile_start[t + 1] - tile_start[t] + CHUNK - 1) // CHUNK
-    return chunk_start
+def _offsets(cursor, splat_start):
+    """Counts -> offsets, in place: where each share writes in each tile's list, where each splat's positions start.
+
+    Returns where each tile's list starts, and the index of its first stored transmittance.
+    """
+    shares, tiles = cursor.shape
+    tile_start = np.empty(tiles + 1, np.int64)
+    chunk_start = np.empty(tiles + 1, np.int64)
+    total = chunks = 0
+    for t in range(tiles):
+        tile_start[t] = total
+        chunk_start[t] = chunks
+        for share in range(shares):
+            count = cursor[share, t]
+            cursor[share, t] = total
+            total += count
+        chunks += (total - tile_start[t] + CHUNK - 1) // CHUNK
+    tile_start[tiles] = total
+    chunk_start[tiles] = chunks
+    start = 0
+    for rank in range(len(splat_start)):
+        count = splat_start[rank]
+        splat_start[rank] = start
+        start += count
+    return tile_start, chunk_start
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------
 # Drawing
 
 
@@ -322,14 +330,17 @@ def _power_of_half(t):
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
-def _profile(sharpness, center, out, at):
-    """out[at : at + 16]: the footprint along one axis of a tile, at the pixel centres 0 … 15."""
+def _profiles(sharpness, x, y, out, at):
+    """out[at : at + 16] and the next 16: the footprint across and down a tile, at the pixel centres 0 … 15."""
     for j in range(LANES):
-        d = sharpness * (f32(j) - center)
+        d = sharpness * (f32(j) - x)
         out[at + j] = _power_of_half(d * d)
+    for j in range(LANES):
+        d = sharpness * (f32(j) - y)
+        out[at + LANES + j] = _power_of_half(d * d)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True)
 def _rows_reached(x, y, reach_squared, first, last):
     """Rows [first, last) of a tile narrowed to those a splat at (x, y), relative to its centres, can reach."""
     dx = max(-x, x - f32(TILE - 1), f32(0.0))
@@ -340,28 +351,31 @@ def _rows_reached(x, y, reach_squared, first, last):
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
-def _blend_row(tile, at, across, across_at, down, r, g, b, alpha_min, alpha_max):
-    """Composite one splat over one row of a tile; planes T, r, g, b."""
-    for j in range(LANES):
-        alpha = min(across[across_at + j] * down, alpha_max)
-        alpha = alpha if alpha >= alpha_min else f32(0.0)
-        T = tile[at + j]
-        weight = alpha * T
-        tile[at + j] = T - weight
-        tile[at + PLANE_1 + j] += weight * r
-        tile[at + PLANE_2 + j] += weight * g
-        tile[at + PLANE_3 + j] += weight * b
+def _blend(tile, profiles, first, last, r, g, b, alpha_min, alpha_max):
+    """Composite one splat over the rows [first, last) of a tile; planes T, r, g, b."""
+    for q in range(first, last):
+        down = profiles[LANES + q]
+        at = q * ROW
+        for j in range(LANES):
+            alpha = min(profiles[j] * down, alpha_max)
+            alpha = alpha if alpha >= alpha_min else f32(0.0)
+            T = tile[at + j]
+            weight = alpha * T
+            tile[at + j] = T - weight
+            tile[at + PLANE_1 + j] += weight * r
+            tile[at + PLANE_2 + j] += weight * g
+            tile[at + PLANE_3 + j] += weight * b
 
 
-@njit(cache=True, nogil=True)
-def _live_rows(T, stride, t_stop):
+@njit(cache=True, nogil=True, fastmath=_FAST)
+def _live_rows(T, stride, t_stop, lanes):
     """Rows [first, last) between the outermost ones with a pixel that still lets light through."""
     first, last = u64(TILE), u64(0)
     for q in range(LANES):
-        most = f32(0.0)
-        for j in range(LANES):
-            most = max(most, T[q * stride + j])
-        if most >= t_stop:
+        alive = 0
+        for j in range(lanes):
+            alive += T[q * stride + j] >= t_stop
+        if alive:
             first = min(first, q)
             last = q + u64(1)
     return first, last
@@ -376,8 +390,9 @@ def _busiest_first(load):
 
 @njit(cache=True, nogil=True, parallel=True)
 def _draw(
-    packed, ranks, tile_start, chunk_start, background, alpha_min, alpha_max, t_stop, store, stored, rgb, alpha, workers
-):
+    entries, tile_start, chunk_start, background, alpha_min, alpha_max, t_stop, lanes, store, stored, rgb, alpha,
+    workers,
+):  # fmt: skip
     """Fill rgb [H, W, 3] and alpha [H, W]; returns how many entries of each tile were composited."""
     height, width = alpha.shape
     tiles_x = (width + TILE - 1) // TILE
@@ -392,8 +407,7 @@ def _draw(
                     rgb[y, x, c] = background[c]
     for w in prange(workers):
         tile = np.empty(TILE * ROW, np.float32)
-        across = np.empty(TILE, np.float32)
-        down = np.empty(TILE, np.float32)
+        profiles = np.empty(2 * TILE, np.float32)
         for turn in range(w, len(order), workers):
             t = order[turn]
             x0, y0 = t % tiles_x * TILE, t // tiles_x * TILE
@@ -406,7 +420,7 @@ def _draw(
             drawn = tile_start[t + 1] - tile_start[t]
             for k in range(drawn):
                 if k % CHUNK == 0:
-                    first, last = _live_rows(tile, ROW, t_stop)
+                    first, last = _live_rows(tile, ROW, t_stop, lanes)
                     if first >= last:
                         drawn = k
                         break
@@ -415,15 +429,11 @@ def _draw(
                         for q in range(TILE):
                             for j in range(TILE):
                                 stored[chunk, q * TILE + j] = tile[q * ROW + j]
-                splat = packed[ranks[tile_start[t] + k]]
+                splat = entries[tile_start[t] + k]
                 x, y = splat[0] - f32(x0) - f32(0.5), splat[1] - f32(y0) - f32(0.5)
-                _profile(splat[2], x, across, u64(0))
-                _profile(splat[2], y, down, u64(0))
+                _profiles(splat[2], x, y, profiles, u64(0))
                 ya, yb = _rows_reached(x, y, splat[3], first, last)
-                for q in range(ya, yb):
-                    _blend_row(
-                        tile, q * ROW, across, u64(0), down[q], splat[4], splat[5], splat[6], alpha_min, alpha_max
-                    )
+                _blend(tile, profiles, ya, yb, splat[4], splat[5], splat[6], alpha_min, alpha_max)
             stop[t] = drawn
             for q in range(inside_y):
                 for j in range(inside_x):
@@ -434,81 +444,85 @@ def _draw(
     return stop
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------
 # The gradient
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
-def _weights_row(T, at, across, across_at, down, weights, weights_at, alpha_min, alpha_max):
-    """Front to back: the weight alpha T of one splat along one row, and the transmittance behind it."""
-    for j in range(LANES):
-        alpha = min(across[across_at + j] * down, alpha_max)
-        alpha = alpha if alpha >= alpha_min else f32(0.0)
-        weight = alpha * T[at + j]
-        weights[weights_at + j] = weight
-        T[at + j] -= weight
+def _weigh(T, profiles, at, first, last, weights, weights_at, alpha_min, alpha_max, lanes):
+    """Front to back: the weights alpha T of one splat on the rows [first, last), and the transmittance behind it."""
+    for q in range(first, last):
+        down = profiles[at + LANES + q]
+        row = q * LANES
+        for j in range(lanes):
+            alpha = min(profiles[at + j] * down, alpha_max)
+            alpha = alpha if alpha >= alpha_min else f32(0.0)
+            before = T[row + j]
+            weight = alpha * before
+            T[row + j] = before - weight
+            weights[weights_at + row + j] = weight
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
-def _gradient_row(
-    tile, at, across, across_at, down, dy, weights, weights_at, r, g, b, alpha_min, alpha_max, sums
+def _gradient(
+    tile, profiles, at, first, last, weights, weights_at, x, y, r, g, b, alpha_min, alpha_max, sums, gradients, e
 ):
-    """Back to front: add one splat's gradients along one row to `sums`; planes seen, gradient of r, g, b."""
-    for j in range(LANES):
-        footprint = across[across_at + j] * down
-        alpha = min(footprint, alpha_max)
-        alpha = alpha if alpha >= alpha_min else f32(0.0)
-        weight = weights[weights_at + j]
-        gr, gg, gb = tile[at + PLANE_1 + j], tile[at + PLANE_2 + j], tile[at + PLANE_3 + j]
-        seen = tile[at + j]
-        change = r * gr + g * gg + b * gb - seen
-        tile[at + j] = seen + alpha * change
-        # d footprint / d parameter is a multiple of the footprint itself, hence the weight; none where it is cut off
-        slope = weight * change if footprint <= alpha_max else f32(0.0)
-        sums[j] += slope
-        sums[PLANE_1 + j] += slope * dy
-        sums[PLANE_2 + j] += slope * (dy * dy)
-        sums[PLANE_3 + j] += weight * gr
-        sums[PLANE_4 + j] += weight * gg
-        sums[PLANE_5 + j] += weight * gb
-
-
-@njit(cache=True, nogil=True, fastmath=_FAST)
-def _sum_columns(sums, x, entries, slot):
-    """Add up the columns of a tile into one gradient entry."""
-    dx_sum = dy_sum = square_sum = r_sum = g_sum = b_sum = f32(0.0)
+    """Back to front: one splat's gradients from the rows [first, last); planes seen, gradient of r, g, b."""
+    sums[:] = f32(0.0)
+    for q in range(first, last):
+        down = profiles[at + LANES + q]
+        dy = f32(q) - y
+        row = q * ROW
+        weights_row = weights_at + q * LANES
+        for j in range(LANES):
+            footprint = profiles[at + j] * down
+            alpha = min(footprint, alpha_max)
+            alpha = alpha if alpha >= alpha_min else f32(0.0)
+            weight = weights[weights_row + j]
+            gr, gg, gb = tile[row + PLANE_1 + j], tile[row + PLANE_2 + j], tile[row + PLANE_3 + j]
+            seen = tile[row + j]
+            change = r * gr + g * gg + b * gb - seen
+            tile[row + j] = seen + alpha * change
+            # d footprint / d parameter is a multiple of the footprint, hence the weight; none where it is cut off
+            slope = weight * change if footprint <= alpha_max else f32(0.0)
+            sums[j] += slope
+            sums[PLANE_1 + j] += slope * dy
+            sums[PLANE_2 + j] += slope * (dy * dy)
+            sums[PLANE_3 + j] += weight * gr
+            sums[PLANE_4 + j] += weight * gg
+            sums[PLANE_5 + j] += weight * gb
+    gx = gy = gs = sum_r = sum_g = sum_b = f32(0.0)
     for j in range(LANES):
         dx = f32(j) - x
-        dx_sum += sums[j] * dx
-        dy_sum += sums[PLANE_1 + j]
-        square_sum += sums[j] * (dx * dx) + sums[PLANE_2 + j]
-        r_sum += sums[PLANE_3 + j]
-        g_sum += sums[PLANE_4 + j]
-        b_sum += sums[PLANE_5 + j]
-    entries[slot, 0] = dx_sum
-    entries[slot, 1] = dy_sum
-    entries[slot, 2] = square_sum
-    entries[slot, 3] = r_sum
-    entries[slot, 4] = g_sum
-    entries[slot, 5] = b_sum
+        gx += sums[j] * dx
+        gy += sums[PLANE_1 + j]
+        gs += sums[j] * (dx * dx) + sums[PLANE_2 + j]
+        sum_r += sums[PLANE_3 + j]
+        sum_g += sums[PLANE_4 + j]
+        sum_b += sums[PLANE_5 + j]
+    gradients[e, 0] = gx
+    gradients[e, 1] = gy
+    gradients[e, 2] = gs
+    gradients[e, 3] = sum_r
+    gradients[e, 4] = sum_g
+    gradients[e, 5] = sum_b
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def _draw_backward(
-    packed, ranks, slots, tile_start, chunk_start, stored, stop, background, grad_rgb, grad_alpha,
-    alpha_min, alpha_max, t_stop, workers,
+    entries, tile_start, chunk_start, stored, stop, background, grad_rgb, grad_alpha,
+    alpha_min, alpha_max, t_stop, lanes, workers,
 ):  # fmt: skip
-    """Gradients per entry [E, GRADIENT], splat by splat: what each tile adds to each splat."""
+    """[E, GRADIENT]: what each entry of each tile adds to the gradient of its splat."""
     height, width = grad_alpha.shape
     tiles_x = (width + TILE - 1) // TILE
-    entries = np.zeros((len(ranks), GRADIENT), np.float32)
-    order = _busiest_first(stop)
+    gradients = np.empty((len(entries), GRADIENT), np.float32)
+    order = _busiest_first(tile_start[1:] - tile_start[:-1])
     for w in prange(workers):
         tile = np.empty(TILE * ROW, np.float32)
         T = np.empty(TILE * TILE, np.float32)
         weights = np.empty(CHUNK * TILE * TILE, np.float32)
-        across = np.empty(CHUNK * TILE, np.float32)
-        down = np.empty(CHUNK * TILE, np.float32)
+        profiles = np.empty(CHUNK * 2 * TILE, np.float32)
         rows = np.empty((CHUNK, 2), np.uint64)
         sums = np.empty(6 * TILE, np.float32)
         for turn in range(w, len(order), workers):
@@ -523,41 +537,33 @@ def _draw_backward(
                         tile[q * ROW + (c + 1) * TILE + j] = gradient
                         seen += gradient * background[c]
                     tile[q * ROW + j] = seen
+            gradients[tile_start[t] + stop[t] : tile_start[t + 1]] = 0.0
             chunks = (stop[t] + CHUNK - 1) // CHUNK
             for chunk in range(chunks - 1, -1, -1):
                 for p in range(TILE * TILE):
                     T[p] = stored[chunk_start[t] + chunk, p]
-                first, last = _live_rows(T, LANES, t_stop)
+                first, last = _live_rows(T, LANES, t_stop, lanes)
                 begin = tile_start[t] + chunk * CHUNK
                 size = min(CHUNK, stop[t] - chunk * CHUNK)
                 for k in range(size):
-                    splat = packed[ranks[begin + k]]
+                    splat = entries[begin + k]
                     x, y = splat[0] - f32(x0) - f32(0.5), splat[1] - f32(y0) - f32(0.5)
-                    _profile(splat[2], x, across, u64(k) * LANES)
-                    _profile(splat[2], y, down, u64(k) * LANES)
+                    _profiles(splat[2], x, y, profiles, u64(k) * PLANE_2)
                     ya, yb = _rows_reached(x, y, splat[3], first, last)
                     rows[k, 0], rows[k, 1] = ya, yb
-                    for q in range(ya, yb):
-                        _weights_row(
-                            T, q * LANES, across, u64(k) * LANES, down[u64(k) * LANES + q],
-                            weights, (u64(k) * LANES + q) * LANES, alpha_min, alpha_max,
-                        )  # fmt: skip
+                    _weigh(T, profiles, u64(k) * PLANE_2, ya, yb, weights, u64(k) * AREA, alpha_min, alpha_max, lanes)
                 for k in range(size - 1, -1, -1):
-                    splat = packed[ranks[begin + k]]
+                    splat = entries[begin + k]
                     x, y = splat[0] - f32(x0) - f32(0.5), splat[1] - f32(y0) - f32(0.5)
-                    sums[:] = 0.0
-                    for q in range(rows[k, 0], rows[k, 1]):
-                        _gradient_row(
-                            tile, q * ROW, across, u64(k) * LANES, down[u64(k) * LANES + q], f32(q) - y,
-                            weights, (u64(k) * LANES + q) * LANES, splat[4], splat[5], splat[6],
-                            alpha_min, alpha_max, sums,
-                        )  # fmt: skip
-                    _sum_columns(sums, x, entries, slots[begin + k])
-    return entries
+                    _gradient(
+                        tile, profiles, u64(k) * PLANE_2, rows[k, 0], rows[k, 1], weights, u64(k) * AREA, x, y,
+                        splat[4], splat[5], splat[6], alpha_min, alpha_max, sums, gradients, begin + k,
+                    )  # fmt: skip
+    return gradients
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _sum_gradients(entries, order, splat_start, variance):
+def _sum_gradients(gradients, positions, order, splat_start, variance):
     """Entries -> gradients of xy [N, 2], variance [N], colors [N, 3]; 0 for splats that no tile has."""
     n = len(variance)
     grad_xy = np.zeros((n, 2))
@@ -566,13 +572,14 @@ def _sum_gradients(entries, order, splat_start, variance):
     for rank in prange(len(order)):
         i = order[rank]
         gx = gy = gs = r = g = b = 0.0
-        for e in range(splat_start[rank], splat_start[rank + 1]):
-            gx += entries[e, 0]
-            gy += entries[e, 1]
-            gs += entries[e, 2]
-            r += entries[e, 3]
-            g += entries[e, 4]
-            b += entries[e, 5]
+        for k in range(splat_start[rank], splat_start[rank + 1]):
+            e = positions[k]
+            gx += gradients[e, 0]
+            gy += gradients[e, 1]
+            gs += gradients[e, 2]
+            r += gradients[e, 3]
+            g += gradients[e, 4]
+            b += gradients[e, 5]
         grad_xy[i, 0] = gx / variance[i]
         grad_xy[i, 1] = gy / variance[i]
         grad_variance[i] = gs / variance[i] / variance[i] / 2

@@ -1,0 +1,177 @@
+"""Stand-ins in ZJU-MoCap's own layout, written where they are missing, so that the real loader reads them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench import atomic
+from ihbench.body import Body, load_body
+from ihbench.datasets import zju_mocap
+from ihbench.datasets.standin.motion import N_FRAMES
+from ihbench.datasets.standin.photograph import photograph
+from ihbench.datasets.standin.rig import N_CAMERAS
+from ihbench.datasets.standin.studio import empty_studio
+from ihbench.datasets.standin.subject import Subject
+from ihbench.errors import BadInput
+from ihbench.progress import Progress
+
+VERSION = 1  # of the generator; a change that moves a pixel raises it
+NAME_PREFIX = "standin-"
+WAITING_THREADS = 2  # beyond one a core: they wait for the disk while the others draw
+
+
+class ZjuStandIn:
+    """Makes captures of procedural people. A file depends on (VERSION, seed, subject, camera, frame) only."""
+
+    version = VERSION
+    n_frames = N_FRAMES
+    n_cameras = N_CAMERAS
+
+    @staticmethod
+    def subjects(count: int = 6) -> list[str]:
+        """The names of the first `count` people of a cast."""
+        return [f"{NAME_PREFIX}{number}" for number in range(1, count + 1)]
+
+    @staticmethod
+    def ensure(
+        root: Path,
+        seed: int,
+        subjects: list[str],
+        wanted: Mapping[int, Iterable[int]],  # camera -> frames
+        progress: Progress | None = None,
+    ) -> Path:
+        """Write what is wanted and not yet there below `root`, and return `root`.
+
+        annots.npy lists every frame and camera and the parameters cover every frame, as in the real data; images,
+        masks and vertices are written for the wanted frames only. Interrupted, the same call goes on where it
+        stopped. Raises `BadInput` for an unknown subject, camera or frame, and when `root` holds something else.
+        """
+        root = Path(root).expanduser()
+        if seed < 0:
+            raise BadInput(f"stand-in seed {seed}: expected 0 or more")
+        numbers = [_number(subject) for subject in subjects]
+        frames_of = {camera: sorted(set(frames)) for camera, frames in sorted(wanted.items())}
+        _check_wanted(frames_of)
+        body = load_body()
+        _claim(root, seed, body)
+        progress = progress or Progress.silent()
+        for name, number in zip(subjects, numbers, strict=True):
+            _ensure_subject(
+                root / f"{zju_mocap.FOLDER_PREFIX}{name}",
+                name,
+                Subject(seed, number, body),
+                frames_of,
+                progress,
+            )
+        return root
+
+
+def _number(subject: str) -> int:
+    number = subject.removeprefix(NAME_PREFIX)
+    if not subject.startswith(NAME_PREFIX) or not number.isdecimal() or int(number) < 1 or number != str(int(number)):
+        raise BadInput(f"stand-in subject {subject!r}: expected {NAME_PREFIX}1, {NAME_PREFIX}2, …")
+    return int(number)
+
+
+def _check_wanted(frames_of: dict[int, list[int]]) -> None:
+    for camera, frames in frames_of.items():
+        if not 0 <= camera < N_CAMERAS:
+            raise BadInput(f"stand-in camera {camera}: expected 0 to {N_CAMERAS - 1}")
+        outside = next((frame for frame in frames if not 0 <= frame < N_FRAMES), None)
+        if outside is not None:
+            raise BadInput(f"stand-in frame {outside}: expected 0 to {N_FRAMES - 1}")
+
+
+def _claim(root: Path, seed: int, body: Body) -> None:
+    """Mark the folder as this cast's, unless it belongs to something else."""
+    mark = {
+        "generator": "ihbench",
+        "version": VERSION,
+        "seed": seed,
+        "body": body.name,
+        "body_sha": body.content_sha(),
+    }
+    path = root / zju_mocap.STANDIN_FILE
+    if path.is_file():
+        found = atomic.read_json(path)
+        if found != mark:
+            raise BadInput(
+                f"{root}: holds another stand-in ({_differences(found, mark)}); choose another folder or remove it"
+            )
+        return
+    if root.exists() and (not root.is_dir() or any(root.iterdir())):
+        raise BadInput(f"{root}: not an empty folder and not a stand-in; choose another folder")
+    atomic.write_json(path, mark)
+
+
+def _differences(found: object, asked: dict[str, object]) -> str:
+    if not isinstance(found, dict):
+        return "no readable mark"
+    differing = [key for key in asked if found.get(key) != asked[key]]
+    return ", ".join(f"{key} {found.get(key)!r}, asked for {asked[key]!r}" for key in differing) or "other keys"
+
+
+def _ensure_subject(
+    folder: Path, name: str, subject: Subject, frames_of: dict[int, list[int]], progress: Progress
+) -> None:
+    paths = zju_mocap.standard_image_paths(N_CAMERAS, N_FRAMES)
+    wanted_frames = sorted({frame for frames in frames_of.values() for frame in frames})
+    pictures = [
+        (camera, frame)
+        for camera, frames in frames_of.items()
+        for frame in frames
+        if not _all_there(folder, paths[frame][camera])
+    ]
+    vertices = [frame for frame in wanted_frames if not (folder / "new_vertices" / f"{frame}.npy").is_file()]
+    params = [frame for frame in range(N_FRAMES) if not (folder / "new_params" / f"{frame}.npy").is_file()]
+
+    @lru_cache(maxsize=128)
+    def clothed(frame: int) -> NDArray[np.float64]:
+        return subject.clothed_vertices(frame)
+
+    @lru_cache(maxsize=3)  # pictures come camera by camera
+    def studio(camera: int) -> NDArray[np.uint8]:
+        return empty_studio(subject.cameras[camera], subject.studio_seed)
+
+    def write_picture(pair: tuple[int, int]) -> None:
+        camera, frame = pair
+        shot = photograph(
+            clothed(frame),
+            subject.body,
+            subject.texture,
+            subject.labels,
+            subject.lighting,
+            subject.cameras[camera],
+            studio(camera),
+        )
+        zju_mocap.write_frame(folder, paths[frame][camera], shot.image, shot.mask, shot.parts)
+
+    if not (folder / "annots.npy").is_file():
+        zju_mocap.write_annots(folder, subject.cameras, paths)
+    for frame in params:
+        zju_mocap.write_params(folder, frame, subject.body_poses[frame], subject.body)
+    for frame in vertices:
+        zju_mocap.write_vertices(folder, frame, subject.vertices(frame))
+    if not pictures:
+        return
+    with progress.task(f"photographing {name}", total=len(pictures)) as task:
+        write_picture(pictures[0])  # computes what the threads share before they start
+        task.advance()
+        pool = ThreadPoolExecutor((os.cpu_count() or 1) + WAITING_THREADS)
+        try:
+            for _ in pool.map(write_picture, pictures[1:]):
+                task.advance()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _all_there(folder: Path, image_path: str) -> bool:
+    masks = [(folder / kind / image_path).with_suffix(".png") for kind in ("mask", "mask_cihp")]
+    return all(path.is_file() for path in (folder / image_path, *masks))

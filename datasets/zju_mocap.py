@@ -1,0 +1,598 @@
+"""ZJU-MoCap in its original layout: read, check and write `CoreView_<subject>` folders.
+
+    CoreView_377/annots.npy               cameras (OpenCV, T in millimetres) and the image paths of every frame
+    CoreView_377/Camera_B1/000000.jpg     1024×1024, lens distortion in
+    CoreView_377/mask/Camera_B1/…png      non-zero = person; mask_cihp/ the same with CIHP part labels
+    CoreView_377/new_params/0.npy         poses, shapes, Rh, Th of the newer fit; params/ is the older fit
+    CoreView_377/new_vertices/0.npy       [V, 3] m, world, what those parameters give
+
+Sources: zju3dv/neuralbody lib/datasets/light_stage/multi_view_dataset.py and zju_smpl/, tiangexiang/OccNeRF
+tools/prepare_zju_mocap. Parameter files are numbered as the images are, which is from 1 for subjects 313 and 315.
+"""
+
+from __future__ import annotations
+
+import io
+import pickle
+import re
+import warnings
+import zlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench import atomic
+from ihbench.body import Body, from_zju_root, load_body, zju_root
+from ihbench.camera import Camera
+from ihbench.errors import BadInput
+from ihbench.registry import nearest
+from ihbench.safe_pickle import load_npy
+from ihbench.scene import BodyPose
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+FOLDER_PREFIX = "CoreView_"
+STANDIN_FILE = "STANDIN.json"  # beside the subjects; only in copies that ihbench made up
+FITS = ("new_params", "params")  # the newer one first: HumanNeRF and OccNeRF use it
+VERTICES = {"new_params": "new_vertices", "params": "vertices"}
+SILHOUETTES = {"mask": ("mask",), "mask_cihp": ("mask_cihp",), "union": ("mask", "mask_cihp")}
+CAMERA_SHAPES = {"K": (3, 3), "D": (5,), "R": (3, 3), "T": (3,)}
+JPEG_QUALITY = 95
+
+
+class ZjuMocap:
+    """A folder that holds `CoreView_*` folders, or one of those folders itself."""
+
+    def __init__(self, root: Path):
+        """Raises `BadInput` when there is no such folder, or nothing of this layout in it."""
+        self.root = Path(root).expanduser()
+        if not self.root.is_dir():
+            raise BadInput(f"{self.root}: no such folder; give the folder that holds {FOLDER_PREFIX}* folders")
+        own_name = self.root.absolute().name  # "." may be a subject's folder
+        if own_name.startswith(FOLDER_PREFIX):
+            self._folders = {own_name.removeprefix(FOLDER_PREFIX): self.root.absolute()}
+        else:
+            self._folders = {
+                folder.name.removeprefix(FOLDER_PREFIX): folder
+                for folder in self.root.glob(f"{FOLDER_PREFIX}*")
+                if folder.is_dir()
+            }
+        if not self._folders:
+            raise BadInput(f"{self.root}: no {FOLDER_PREFIX}* folder in it{_where_else(self.root)}")
+
+    @staticmethod
+    def check(root: Path) -> dict[str, Any]:
+        """What this copy is and what it lacks; see `check` below."""
+        return check(root)
+
+    def subjects(self) -> list[str]:
+        """Names without `CoreView_`, in natural order."""
+        return sorted(self._folders, key=_natural)
+
+    def open(self, subject: str, body: Body | None = None) -> ZjuCapture:
+        """One subject. Reads annots.npy only.
+
+        `body` is the SMPL model the parameters belong to; without it a real capture opens, but `body_pose` raises.
+        Stand-ins take the bench's own body by themselves. Raises `BadInput` for an unknown subject or a damaged one.
+        """
+        if subject not in self._folders:
+            raise BadInput(f"{self.root}: no subject {subject!r}: {nearest(subject, self.subjects())}")
+        return ZjuCapture(self._folders[subject], body)
+
+
+class ZjuCapture:
+    """One subject, read lazily; see `ihbench.scene.Capture`. Keeps no images."""
+
+    dataset = "zju_mocap"
+
+    def __init__(self, folder: Path, body: Body | None = None):
+        self.folder = folder
+        self.name = folder.name.removeprefix(FOLDER_PREFIX)
+        self._mark = _standin_mark(folder)
+        self.standin = f"stand-in v{self._mark['version']} seed {self._mark['seed']}" if self._mark else ""
+        self.body = "procedural" if self.standin else "smpl"
+        if body is not None and body.name != self.body:
+            raise BadInput(
+                f"{folder}: its parameters belong to the {self.body} body, but the {body.name} body was given; "
+                f"{'give no body file' if self.standin else 'give an SMPL file (--body or IHBENCH_BODY)'}"
+            )
+        self._given_body = body
+        self._annots = read_annots(folder / "annots.npy")
+        self.fit = next((name for name in FITS if (folder / name).is_dir()), None)
+        if self.fit is None:
+            raise BadInput(
+                f"{folder}: neither {' nor '.join(FITS)} in it; expected SMPL parameters, one file a frame"
+            )
+        self.variant = f"original/{self.fit}"
+        self.n_frames = len(self._annots.image_paths)
+        self.camera_ids = self._annots.camera_ids
+        self._sizes: dict[int, tuple[int, int]] = {}
+
+    def camera(self, camera: int) -> Camera:
+        """The calibrated view with its lens distortion; its size comes from the header of one of its images."""
+        self._check_index(camera, 0)
+        width, height = self._image_size(camera)
+        K, D, R, T = (self._annots.cameras[key][camera] for key in CAMERA_SHAPES)
+        return Camera.from_opencv(K, R, T / 1000, width, height, D)
+
+    def body_pose(self, frame: int) -> BodyPose:
+        """The frame's SMPL parameters in the standard root convention."""
+        path = self.params_path(frame)
+        poses, shapes, Rh, Th = read_params(path)
+        body = self._smpl_body
+        try:
+            return from_zju_root(poses, shapes, Rh, Th, body)
+        except BadInput as error:
+            raise BadInput(f"{path}: {error}") from error
+
+    def vertices(self, frame: int) -> NDArray[np.float64]:
+        """[V, 3] m, world: the fitted body mesh as stored."""
+        assert self.fit is not None
+        path = self.folder / VERTICES[self.fit] / f"{self.number(frame)}.npy"
+        if not path.is_file():
+            raise BadInput(f"{path}: no such file; expected the body's vertices at frame {frame}")
+        vertices = load_npy(path)
+        if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.dtype.kind != "f":
+            raise BadInput(f"{path}: expected numbers of shape [V, 3] in metres, found {_shape_of(vertices)}")
+        if not np.isfinite(vertices).all():
+            raise BadInput(f"{path}: NaN or infinite vertices; expected finite metres")
+        return vertices.astype(np.float64)
+
+    def image(self, camera: int, frame: int) -> NDArray[np.uint8]:
+        """[H, W, 3] RGB, as stored."""
+        path = self.image_path(camera, frame)
+        image = self._read_picture(path, "RGB")
+        self._check_size(path, image, camera)
+        return image
+
+    def silhouette(self, camera: int, frame: int, source: str = "mask") -> NDArray[np.bool_]:
+        """[H, W]. `source` is "mask", "mask_cihp" or "union" (either of the two, as HumanNeRF and OccNeRF)."""
+        if source not in SILHOUETTES:
+            raise BadInput(f"silhouette source {source!r}: {nearest(source, list(SILHOUETTES))}")
+        person = None
+        for kind in SILHOUETTES[source]:
+            path = self.mask_path(camera, frame, kind)
+            mask = self._read_picture(path)
+            self._check_size(path, mask, camera)
+            here = (mask if mask.ndim == 2 else mask.max(2)) != 0
+            person = here if person is None else person | here
+        assert person is not None
+        return person
+
+    def number(self, frame: int) -> int:
+        """The number that the frame's parameter and vertex files carry; 313 and 315 count from 1."""
+        self._check_index(0, frame)
+        return _frame_number(self._annots.image_paths[frame][0], self.folder)
+
+    def image_path(self, camera: int, frame: int) -> Path:
+        self._check_index(camera, frame)
+        return self.folder / self._annots.image_paths[frame][camera]
+
+    def mask_path(self, camera: int, frame: int, kind: str = "mask") -> Path:
+        self._check_index(camera, frame)
+        return self.folder / kind / PurePosixPath(self._annots.image_paths[frame][camera]).with_suffix(".png")
+
+    def params_path(self, frame: int) -> Path:
+        assert self.fit is not None
+        return self.folder / self.fit / f"{self.number(frame)}.npy"
+
+    @cached_property
+    def _smpl_body(self) -> Body:
+        body = self._given_body
+        if body is None and not self._mark:
+            raise BadInput(
+                f"{self.folder}: its poses need the SMPL model, which ihbench may not ship; "
+                f"give your SMPL file with --body FILE or IHBENCH_BODY"
+            )
+        body = body or load_body()
+        if self._mark and self._mark["body_sha"] != body.content_sha():
+            raise BadInput(
+                f"{self.folder}: made with another version of the procedural body than this ihbench has; "
+                f"remove the stand-in and make it anew"
+            )
+        return body
+
+    def _check_index(self, camera: int, frame: int) -> None:
+        if not 0 <= camera < len(self.camera_ids):
+            n = len(self.camera_ids)
+            raise BadInput(f"{self.folder}: no camera {camera}; it has {n} cameras, 0 to {n - 1}")
+        if not 0 <= frame < self.n_frames:
+            raise BadInput(
+                f"{self.folder}: no frame {frame}; it has {self.n_frames} frames, 0 to {self.n_frames - 1}"
+            )
+
+    def _image_size(self, camera: int) -> tuple[int, int]:
+        """(width, height) px of the camera's first image on disk."""
+        if camera not in self._sizes:
+            paths = (self.image_path(camera, frame) for frame in range(self.n_frames))
+            path = next((path for path in paths if path.is_file()), None)
+            if path is None:
+                folder = self.image_path(camera, 0).parent
+                state = "no image in it" if folder.is_dir() else "no such folder"
+                raise BadInput(f"{folder}: {state}; expected the images of camera {camera}{self._standin_hint()}")
+            with _opened(path) as picture:
+                self._sizes[camera] = picture.size
+        return self._sizes[camera]
+
+    def _read_picture(self, path: Path, mode: str | None = None) -> NDArray[np.uint8]:
+        if not path.is_file():
+            missing = "file" if path.parent.is_dir() else f"file, nor its folder {path.parent.name}"
+            raise BadInput(f"{path}: no such {missing}; annots.npy lists it{self._standin_hint()}")
+        return _decoded(path, mode)
+
+    def _check_size(self, path: Path, picture: NDArray, camera: int) -> None:
+        width, height = self._image_size(camera)
+        if picture.shape[:2] != (height, width):
+            raise BadInput(
+                f"{path}: {picture.shape[1]}×{picture.shape[0]} px, but the camera's images are {width}×{height} px; "
+                f"expected one size for a camera's images and masks"
+            )
+
+    def _standin_hint(self) -> str:
+        return "; a stand-in holds only the images it was asked for, ask for this one too" if self.standin else ""
+
+
+@dataclass(frozen=True)
+class Annots:
+    """annots.npy, checked."""
+
+    cameras: dict[str, NDArray[np.float64]]  # K [N, 3, 3], D [N, 5], R [N, 3, 3], T [N, 3] mm
+    image_paths: list[tuple[str, ...]]  # per frame, one path a camera, relative to the subject's folder
+    camera_ids: tuple[str, ...]  # the folders of the images
+
+
+def read_annots(path: Path) -> Annots:
+    """Cameras and image paths of one subject. Raises `BadInput` naming the field that is not as expected."""
+    if not path.is_file():
+        raise BadInput(f"{path}: no such file; expected the cameras and image paths of this subject in it")
+    content = load_npy(path)
+    content = content.item() if content.shape == () and content.dtype == object else None
+    if not isinstance(content, dict) or not {"cams", "ims"} <= content.keys():
+        raise BadInput(f"{path}: expected a dictionary with 'cams' and 'ims', found {_described(content)}")
+    if not isinstance(content["cams"], dict):
+        raise BadInput(f"{path}: expected 'cams' to be a dictionary, found {_described(content['cams'])}")
+    cameras = {key: _camera_field(content["cams"], key, path) for key in CAMERA_SHAPES}
+    counts = {key: len(value) for key, value in cameras.items()}
+    n_cameras = counts["K"]
+    if len(set(counts.values())) != 1 or n_cameras == 0:
+        found = ", ".join(f"{n} {key}" for key, n in counts.items())
+        raise BadInput(f"{path}: expected as many K, D, R and T as cameras, found {found}")
+    _check_calibration(cameras, path)
+    image_paths = _image_paths(content["ims"], n_cameras, path)
+    camera_ids = tuple(PurePosixPath(image).parent.as_posix() for image in image_paths[0])
+    return Annots(cameras, image_paths, camera_ids)
+
+
+def _camera_field(cams: dict, key: str, path: Path) -> NDArray[np.float64]:
+    shape = CAMERA_SHAPES[key]
+    wanted = f"expected cams[{key!r}] to be one array of shape {list(shape)} for each camera"
+    if key not in cams:
+        raise BadInput(f"{path}: {wanted}, found no such key")
+    try:
+        stacked = np.array([np.asarray(value, np.float64) for value in cams[key]])
+    except (TypeError, ValueError):
+        raise BadInput(f"{path}: {wanted}, found {_described(cams[key])} of other contents") from None
+    flat_vector = len(shape) == 1 and stacked.ndim == 3 and 1 in stacked.shape[1:]
+    if flat_vector:  # stored as a column or a row
+        stacked = stacked.reshape(len(stacked), -1)
+    if stacked.shape[1:] != shape:
+        raise BadInput(f"{path}: {wanted}, found {list(stacked.shape[1:])}")
+    if not np.isfinite(stacked).all():
+        raise BadInput(f"{path}: {wanted}, found NaN or infinity in it")
+    return stacked
+
+
+def _check_calibration(cameras: dict[str, NDArray[np.float64]], path: Path) -> None:
+    R = cameras["R"]
+    off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max((1, 2))
+    bad = np.flatnonzero((off > 1e-3) | (np.linalg.det(R) < 0))
+    if len(bad):
+        raise BadInput(f"{path}: expected rotation matrices in cams['R'], found another matrix for camera {bad[0]}")
+    furthest = np.linalg.norm(cameras["T"], axis=1).max()
+    if furthest < 100:
+        raise BadInput(
+            f"{path}: expected cams['T'] in millimetres, found no camera further than {furthest:.3g} from the "
+            f"origin; multiply T by 1000 if it is in metres"
+        )
+
+
+def _image_paths(ims: Any, n_cameras: int, path: Path) -> list[tuple[str, ...]]:
+    wanted = "expected 'ims' to be one {'ims': [image paths]} for each frame"
+    try:
+        frames = [tuple(str(image) for image in frame["ims"]) for frame in ims]
+    except (TypeError, KeyError, IndexError):
+        raise BadInput(f"{path}: {wanted}, found {_described(ims)} of other contents") from None
+    if not frames:
+        raise BadInput(f"{path}: {wanted}, found no frame")
+    for index, frame in enumerate(frames):
+        if len(frame) != n_cameras:
+            raise BadInput(
+                f"{path}: expected {n_cameras} image paths a frame, as many as cameras, "
+                f"found {len(frame)} in frame {index}"
+            )
+        for image in frame:
+            if image.startswith("/") or "\\" in image or "\0" in image or ".." in image.split("/"):
+                raise BadInput(f"{path}: image path {image!r} of frame {index} leads out of the subject's folder")
+    return frames
+
+
+def read_params(path: Path) -> tuple[NDArray[np.float64], ...]:
+    """(poses [72 or 69], shapes [B], Rh [3] rad, Th [3] m) of one parameter file. Raises `BadInput`."""
+    if not path.is_file():
+        raise BadInput(f"{path}: no such file; expected the frame's poses, shapes, Rh and Th")
+    content = load_npy(path)
+    content = content.item() if content.shape == () and content.dtype == object else None
+    sizes = {"poses": (72, 69), "shapes": (10, 300), "Rh": (3,), "Th": (3,)}
+    if not isinstance(content, dict) or not sizes.keys() <= content.keys():
+        raise BadInput(f"{path}: expected a dictionary with poses, shapes, Rh and Th, found {_described(content)}")
+    values = []
+    for key, allowed in sizes.items():
+        try:
+            value = np.asarray(content[key], np.float64).reshape(-1)
+        except (TypeError, ValueError):
+            raise BadInput(f"{path}: expected numbers in {key!r}, found {_described(content[key])}") from None
+        if value.size not in allowed:
+            raise BadInput(
+                f"{path}: expected {' or '.join(str(n) for n in allowed)} numbers in {key!r}, found {value.size}"
+            )
+        if not np.isfinite(value).all():
+            raise BadInput(f"{path}: NaN or infinity in {key!r}; expected finite numbers, leave this frame out")
+        values.append(value)
+    return tuple(values)
+
+
+def _frame_number(image: str, folder: Path) -> int:
+    """000012.jpg -> 12; CoreView_313_Camera_(1)_0013_2019-….jpg -> 13, the fifth token, as NeuralBody reads it."""
+    stem = PurePosixPath(image).stem
+    tokens = stem.split("_")
+    number = stem if stem.isdecimal() else tokens[4] if len(tokens) > 4 else ""
+    if not number.isdecimal():
+        raise BadInput(f"{folder / 'annots.npy'}: image path {image!r} holds no frame number; expected NNNNNN.jpg")
+    return int(number)
+
+
+def _opened(path: Path) -> Image.Image:
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            return Image.open(path)
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
+        raise BadInput(f"{path}: not a readable image ({_one_line(error)}); copy the file again") from error
+
+
+def _decoded(path: Path, mode: str | None) -> NDArray[np.uint8]:
+    with _opened(path) as picture:
+        try:
+            picture.load()
+        except (OSError, SyntaxError, ValueError, zlib.error) as error:
+            raise BadInput(f"{path}: damaged or cut short ({_one_line(error)}); copy the file again") from error
+        if mode is None and picture.mode in ("LA", "RGBA"):  # an opaque alpha channel is no label
+            mode = picture.mode.removesuffix("A")
+        return np.array(picture if mode is None else picture.convert(mode))
+
+
+def _standin_mark(folder: Path) -> dict[str, Any]:
+    """What STANDIN.json beside the subject says: version, seed and body_sha; empty for real data."""
+    path = folder.parent / STANDIN_FILE
+    if not path.is_file():
+        return {}
+    mark = atomic.read_json(path)
+    if not isinstance(mark, dict) or not {"version", "seed", "body_sha"} <= mark.keys():
+        raise BadInput(f"{path}: expected version, seed and body_sha of the stand-in; make the stand-in anew")
+    return mark
+
+
+def _where_else(root: Path) -> str:
+    below = next((path.parent for path in sorted(root.glob(f"*/{FOLDER_PREFIX}*"))), None)
+    if below is not None:
+        return f"; there is one in {below}, give that folder"
+    if any(path.is_dir() for path in root.glob("my_[0-9]*")):
+        return "; this looks like the ZJU-MoCap-refine repack (my_*), expected the original release"
+    return "; expected the original ZJU-MoCap release, unpacked"
+
+
+def _natural(name: str) -> list[tuple[int, int | str]]:
+    return [(0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", name) if part]
+
+
+def _described(value: object) -> str:
+    if isinstance(value, dict):
+        return f"a dictionary with {', '.join(sorted(str(key) for key in value)) or 'nothing'}"
+    return _shape_of(value) if isinstance(value, np.ndarray) else f"a {type(value).__name__}"
+
+
+def _shape_of(array: NDArray) -> str:
+    return f"a {array.dtype} array of shape {list(array.shape)}"
+
+
+def _one_line(error: object) -> str:
+    return " ".join(str(error).split())[:120]
+
+
+# ----------------------------------------------------------------------------------------------- check
+
+
+def check(root: Path, samples: int = 3) -> dict[str, Any]:
+    """What this copy is and what it lacks, for `ihbench data check`.
+
+    Lists folders and decodes `samples` frames of two cameras a subject; it does not decode everything. Raises
+    `BadInput` when the root is not of this layout at all; what is wrong with a subject is listed in its "problems".
+    `vertices_in_mask` is the share of body vertices that project into the person's silhouette (grown by 1 % of the
+    image's width), over the sampled images: well below 0.95 means wrong cameras, units or parameters.
+    """
+    dataset = ZjuMocap(root)
+    subjects = [_check_subject(dataset, name, samples) for name in dataset.subjects()]
+    return {
+        "dataset": ZjuCapture.dataset,
+        "layout": "original",
+        "root": str(dataset.root),
+        "standin": next((subject["standin"] for subject in subjects if subject.get("standin")), ""),
+        "subjects": subjects,
+        "ok": not any(subject["problems"] for subject in subjects),
+    }
+
+
+def _check_subject(dataset: ZjuMocap, name: str, samples: int) -> dict[str, Any]:
+    problems: list[str] = []
+    found: dict[str, Any] = {"subject": name, "problems": problems}
+    try:
+        capture = dataset.open(name)
+    except BadInput as error:
+        problems.append(str(error))
+        return found
+    n_cameras, n_frames = len(capture.camera_ids), capture.n_frames
+    pairs = [(camera, frame) for camera in range(n_cameras) for frame in range(n_frames)]
+    kinds = ("image", "mask", "mask_cihp")
+    present: dict[str, set[tuple[int, int]]] = {}
+    for kind in kinds:
+        path_of = capture.image_path if kind == "image" else lambda c, f, kind=kind: capture.mask_path(c, f, kind)
+        listed = _listing({path_of(camera, 0).parent for camera in range(n_cameras)})
+        present[kind] = {pair for pair in pairs if path_of(*pair) in listed}
+    params = _listing({capture.folder / fit for fit in FITS} | {capture.folder / VERTICES[fit] for fit in FITS})
+    numbers = [f"{capture.number(frame)}.npy" for frame in range(n_frames)]
+    assert capture.fit is not None
+    missing = {kind: len(pairs) - len(present[kind]) for kind in kinds}
+    for part in (capture.fit, VERTICES[capture.fit]):
+        missing[part] = sum(capture.folder / part / number not in params for number in numbers)
+    found |= {
+        "standin": capture.standin,
+        "body": capture.body,
+        "variant": capture.variant,
+        "cameras": n_cameras,
+        "frames": n_frames,
+        "files": {kind: len(present[kind]) for kind in kinds},
+        "missing": missing,
+    }
+    complete = sorted(present["image"] & present["mask"])
+    if not capture.standin:
+        problems += [f"{n} of {what} missing" for what, n in missing.items() if n and what != "mask_cihp"]
+    if complete:
+        _sample(capture, complete, samples, found, problems)
+    else:
+        problems.append("no image with its mask found")
+    return found
+
+
+def _listing(folders: Iterable[Path]) -> set[Path]:
+    return {path for folder in folders if folder.is_dir() for path in folder.iterdir()}
+
+
+def _sample(
+    capture: ZjuCapture, complete: list[tuple[int, int]], samples: int, found: dict[str, Any], problems: list[str]
+) -> None:
+    """Decode a few images of the first and last camera, and project the body into their masks."""
+    from scipy.ndimage import binary_dilation
+
+    inside, sizes, decoded = [], set(), 0
+    for camera in sorted({complete[0][0], complete[-1][0]}):
+        frames = [frame for other, frame in complete if other == camera]
+        for frame in sorted({frames[i] for i in np.linspace(0, len(frames) - 1, samples).astype(int)}):
+            try:
+                height, width, _ = capture.image(camera, frame).shape
+                sizes.add((width, height))
+                silhouette = capture.silhouette(camera, frame)
+                read_params(capture.params_path(frame))
+                points = capture.camera(camera).project(capture.vertices(frame))
+            except BadInput as error:
+                problems.append(str(error))
+                continue
+            decoded += 1
+            grown = binary_dilation(silhouette, iterations=max(1, silhouette.shape[1] // 100))
+            inside.append(_share_inside(points, np.asarray(grown, bool)))
+    found["sampled_images"] = decoded
+    found["image_size"] = sorted([list(size) for size in sizes])
+    if inside:
+        share = found["vertices_in_mask"] = round(float(np.mean(inside)), 4)
+        if share < 0.95:
+            problems.append(
+                f"only {share:.0%} of the body's vertices project into the silhouettes; expected over 95 %"
+            )
+
+
+def _share_inside(points: NDArray[np.float64], region: NDArray[np.bool_]) -> float:
+    """The share of projected points [V, 3] (x px, y px, depth m) that fall on the region [H, W]."""
+    height, width = region.shape
+    column, row = np.floor(points[:, 0]), np.floor(points[:, 1])
+    seen = (points[:, 2] > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    hits = region[row[seen].astype(int), column[seen].astype(int)].sum()
+    return float(hits) / len(points)
+
+
+# ----------------------------------------------------------------------------------------------- write
+
+
+def standard_image_paths(n_cameras: int, n_frames: int) -> list[list[str]]:
+    """Per frame the paths of the original release: Camera_B1/000000.jpg for camera 0, frame 0."""
+    return [[f"Camera_B{camera + 1}/{frame:06d}.jpg" for camera in range(n_cameras)] for frame in range(n_frames)]
+
+
+def write_annots(folder: Path, cameras: Sequence[Camera], image_paths: Sequence[Sequence[str]]) -> None:
+    """annots.npy for cameras and the image paths of every frame; `read_annots` and `ZjuCapture.camera` undo it."""
+    if any(len(frame) != len(cameras) for frame in image_paths):
+        raise ValueError(f"annots: expected {len(cameras)} image paths a frame, one for each camera")
+    distortion = [np.zeros(5) if camera.distortion is None else camera.distortion for camera in cameras]
+    cams = {
+        "K": [camera.K_opencv for camera in cameras],
+        "D": [d.reshape(5, 1) for d in distortion],
+        "R": [camera.R.copy() for camera in cameras],
+        "T": [1000 * camera.t.reshape(3, 1) for camera in cameras],
+    }
+    _write_object(folder / "annots.npy", {"cams": cams, "ims": [{"ims": list(frame)} for frame in image_paths]})
+
+
+def write_frame(
+    folder: Path,
+    image_path: str,  # as annots.npy lists it
+    image: NDArray[np.uint8] | None = None,  # [H, W, 3] RGB
+    mask: NDArray | None = None,  # [H, W] non-zero = person
+    mask_cihp: NDArray[np.uint8] | None = None,  # [H, W] CIHP part labels
+) -> None:
+    """The picture files of one camera at one frame: JPEG of quality 95, masks as 8-bit PNG. None is not written."""
+    if image is not None:
+        atomic.write_bytes(folder / image_path, _encoded(image, "JPEG", quality=JPEG_QUALITY), durable=False)
+    for kind, labels in (("mask", mask), ("mask_cihp", mask_cihp)):
+        if labels is not None:
+            path = folder / kind / PurePosixPath(image_path).with_suffix(".png")
+            atomic.write_bytes(path, _encoded(labels.astype(np.uint8), "PNG", compress_level=3), durable=False)
+
+
+def write_params(folder: Path, number: int, body_pose: BodyPose, body: Body, fit: str = "new_params") -> None:
+    """The frame's parameter file with the root as ZJU-MoCap keeps it; `ZjuCapture.body_pose` undoes it."""
+    Rh, Th = zju_root(body_pose, body)
+    poses = body_pose.pose.copy()
+    poses[0] = 0
+    row = {"poses": poses.reshape(1, 72), "shapes": body_pose.betas[None].copy(), "Rh": Rh[None], "Th": Th[None]}
+    _write_object(folder / fit / f"{number}.npy", row)
+
+
+def write_vertices(folder: Path, number: int, vertices: NDArray[np.floating], fit: str = "new_params") -> None:
+    """The frame's vertex file: [V, 3] m, world, float32."""
+    buffer = io.BytesIO()
+    np.save(buffer, np.asarray(vertices, np.float32))
+    atomic.write_bytes(folder / VERTICES[fit] / f"{number}.npy", buffer.getvalue(), durable=False)
+
+
+def _encoded(picture: NDArray[np.uint8], kind: str, **options: int) -> bytes:
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(picture).save(buffer, kind, **options)
+    return buffer.getvalue()
+
+
+def _write_object(path: Path, value: dict[str, Any]) -> None:
+    """A dictionary as np.save would write it, but with numpy 1's module names, which numpy 1 and 2 both read."""
+    buffer = io.BytesIO()
+    np.lib.format.write_array_header_1_0(buffer, {"descr": "|O", "fortran_order": False, "shape": ()})
+    # protocol 3 spells module names as plain lines without lengths, so they can be replaced in place
+    pickled = pickle.dumps(np.array(value, dtype=object), protocol=3)
+    buffer.write(pickled.replace(b"cnumpy._core.multiarray\n", b"cnumpy.core.multiarray\n"))
+    atomic.write_bytes(path, buffer.getvalue(), durable=False)

@@ -1,0 +1,102 @@
+"""`ihbench data check DIR` and `ihbench data standin`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from ihbench import registry
+from ihbench.commands.parse import options
+from ihbench.errors import BadInput
+
+
+@dataclass(frozen=True)
+class Check:
+    """Name the layout and variant found in a folder, and what is missing. Changes nothing."""
+
+    folder: Annotated[Path, tyro.conf.Positional]
+    """The data folder."""
+    json: bool = False
+    """Print one JSON object on stdout."""
+
+
+@dataclass(frozen=True)
+class Standin:
+    """Write a stand-in capture in a data set's own layout."""
+
+    out: Path
+    """Folder to write into; images that are already there are kept."""
+    dataset: str = "zju_mocap"
+    """Whose layout."""
+    seed: int = 0
+    """Another seed is another cast: other bodies, clothes and motions."""
+    subjects: int = 1
+    """How many people."""
+    protocol: str = "zju_occ"
+    """Which images: those that this protocol reads."""
+    profile: str = "paper"
+    """Profile of that protocol."""
+
+
+Command = (
+    Annotated[Check, tyro.conf.subcommand("check", description=Check.__doc__)]
+    | Annotated[Standin, tyro.conf.subcommand("standin", description=Standin.__doc__)]
+)
+
+
+def main(argv: list[str]) -> int:
+    chosen = options(Command, argv, "data", "Check a data folder, or write a stand-in capture.")  # type: ignore[arg-type]
+    return _check(chosen) if isinstance(chosen, Check) else _standin(chosen)
+
+
+def _check(chosen: Check) -> int:
+    if not chosen.folder.is_dir():
+        raise BadInput(f"data folder {chosen.folder}: does not exist")
+    complaints = []
+    for name in registry.names("dataset"):
+        try:
+            found = registry.load("dataset", name).check(chosen.folder)
+        except BadInput as error:
+            complaints.append(f"{name}: {error}")
+            continue
+        print(json.dumps(found, ensure_ascii=False) if chosen.json else "\n".join(_lines(found)))
+        return 0 if found["ok"] else 1
+    raise BadInput(f"data folder {chosen.folder}: no known layout ({'; '.join(complaints)})")
+
+
+def _lines(value: Any, indent: str = "") -> Iterator[str]:
+    """Nested plain data as indented "key: value" lines."""
+    for key, item in value.items():
+        if isinstance(item, dict):
+            yield f"{indent}{key}:"
+            yield from _lines(item, indent + "  ")
+        elif isinstance(item, list) and any(isinstance(entry, dict) for entry in item):
+            for entry in item:
+                yield f"{indent}{key.removesuffix('s')}:"
+                yield from _lines(entry, indent + "  ")
+        elif isinstance(item, list):
+            yield f"{indent}{key}: {', '.join(map(str, item)) or 'none'}"
+        else:
+            yield f"{indent}{key}: {item if item != '' else '-'}"
+
+
+def _standin(chosen: Standin) -> int:
+    from ihbench.data_source import wanted_frames
+    from ihbench.progress import Progress
+    from ihbench.protocol import load_protocol
+
+    if chosen.subjects < 1:
+        raise BadInput(f"--subjects {chosen.subjects}: expected 1 or more")
+    protocol = load_protocol(chosen.protocol, chosen.profile)
+    if protocol.dataset != chosen.dataset:
+        raise BadInput(f"protocol {protocol.name} is about {protocol.dataset!r}, not {chosen.dataset!r}")
+    standin = registry.load("stand-in", chosen.dataset)
+    names = standin.subjects(chosen.subjects)
+    standin.ensure(chosen.out, chosen.seed, names, wanted_frames(protocol, standin), Progress())
+    print(f"{', '.join(names)} (seed {chosen.seed}) written to {chosen.out}; run with --data {chosen.out}")
+    return 0

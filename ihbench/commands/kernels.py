@@ -1,0 +1,29 @@
+"""`ihbench kernels`: work-precision of the bench's own kernels."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
+
+from ihbench.commands.parse import options
+
+
+@dataclass(frozen=True)
+class KernelOptions:
+    kernel: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Kernels to measure; none means all."""
+    json: bool = False
+    """Print one JSON object on stdout."""
+
+
+def main(argv: list[str]) -> int:
+    chosen = options(KernelOptions, argv, "kernels", "Error against the float64 oracle, and milliseconds, per back end.")
+    from ihbench.kernels import run_kernels
+
+    rows = run_kernels(list(chosen.kernel) or None, chosen.json)
+    if chosen.json:
+        print(json.dumps(rows))
+    return 0

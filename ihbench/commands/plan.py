@@ -1,0 +1,89 @@
+"""`ihbench plan`: what a run would do, what is left out and why. Runs nothing, imports neither torch nor cv2."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from ihbench import registry
+from ihbench.commands.parse import options
+
+
+@dataclass(frozen=True)
+class PlanOptions:
+    protocol: str
+    """Protocol to plan."""
+    method: str = "inpainthuman"
+    """Method to plan."""
+    scene: tuple[str, ...] = ()
+    """Scenes; none means all of the protocol's."""
+    profile: str = "quick"
+    """quick or paper."""
+    data: Path | None = None
+    """Your copy of the data set; without it (and without IHBENCH_DATA) the stand-in."""
+    body: Path | None = None
+    """SMPL model file for real data (or IHBENCH_BODY)."""
+    runs: Path = Path("runs")
+    """Where earlier runs lie: expected times come from them."""
+    json: bool = False
+    """Print one JSON object on stdout."""
+
+
+def main(argv: list[str]) -> int:
+    chosen = options(PlanOptions, argv, "plan", "What a run would do, what is left out and why. Runs nothing.")
+    from ihbench.data_source import locate, open_capture
+    from ihbench.plan import absent_regions, expected_seconds, measure_scene
+    from ihbench.protocol import load_protocol
+
+    protocol = load_protocol(chosen.protocol, chosen.profile)
+    registry.entry_point("method", chosen.method)
+    configs = registry.load("config", chosen.method)
+    config = configs.PROFILES[chosen.profile]
+    source = locate(protocol, chosen.data, chosen.scene)
+    expected = expected_seconds(chosen.runs, chosen.method, chosen.profile)
+    report = {
+        "protocol": protocol.name,
+        "profile": chosen.profile,
+        "method": chosen.method,
+        "data": "stand-in" if source.is_standin else str(source.root),
+        "expected_seconds_per_scene": expected,
+        "config": asdict(config),
+        "scenes": {},
+    }
+    for scene in source.scenes:
+        if not source.exists(scene):
+            report["scenes"][scene] = {"note": "stand-in not made yet: the run makes it; measured then"}
+            continue
+        capture, body = open_capture(protocol.dataset, source.root, scene, chosen.body)
+        measure = measure_scene(capture, protocol, body)
+        omissions = configs.leave_out(config, measure) + absent_regions(measure, protocol.regions)
+        report["scenes"][scene] = {"measure": asdict(measure), "left_out": [asdict(o) for o in omissions]}
+    if chosen.json:
+        print(json.dumps(report, ensure_ascii=False))
+        return 0
+    _print(report)
+    return 0
+
+
+def _print(report: dict) -> None:
+    print(f"{report['method']} under {report['protocol']}, {report['profile']} profile, on {report['data']}")
+    seconds = report["expected_seconds_per_scene"]
+    print(f"expected: {seconds:.0f} s per scene, from earlier runs" if seconds else "expected: unknown, no earlier run to go by")
+    for scene, found in report["scenes"].items():
+        print(f"\n{scene}")
+        if "note" in found:
+            print(f"  {found['note']}")
+            continue
+        m = found["measure"]
+        print(f"  {m['training_views']} training views ({m['covered_views']} occluded), {m['test_views']} test views")
+        print(f"  occlusion {m['occlusion']}: hides {m['hidden_share']:.0%} of the person in occluded views")
+        print(
+            f"  surface: {m['visible_texels']:.0%} seen, {m['hidden_texels']:.0%} only behind the occluder, "
+            f"{m['never_seen_texels']:.0%} never faced the camera"
+        )
+        print(f"  joints move up to {m['motion_deg']:.0f}°, the person turns {m['turn_deg']:.0f}°, a pixel is {m['pixel_mm']:.1f} mm")
+        for o in found["left_out"]:
+            print(f"  left out: {o['field']} -> {o['value']}: {o['reason']}")
+        if not found["left_out"]:
+            print("  left out: nothing; this scene needs all of it")

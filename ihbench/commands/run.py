@@ -1,0 +1,151 @@
+"""`ihbench run --protocol P`: the main job."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field, make_dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from ihbench import registry
+from ihbench.commands.parse import options
+from ihbench.errors import BadInput
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    protocol: str
+    """Protocol to run; see `ihbench list protocols`."""
+    method: str = "inpainthuman"
+    """Method to fit; see `ihbench list methods`."""
+    scene: tuple[str, ...] = ()
+    """Scenes; none means all that the protocol names."""
+    profile: str = "quick"
+    """quick (256 px, for a CPU) or paper (512 px, the paper's settings)."""
+    data: Path | None = None
+    """Your copy of the data set; without it (and without IHBENCH_DATA) a stand-in is made."""
+    body: Path | None = None
+    """SMPL model file for real data (or IHBENCH_BODY)."""
+    runs: Path = Path("runs")
+    """Where run folders are written."""
+    seed: tuple[int, ...] = (0,)
+    """Seeds; each is a run of its own."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where to fit."""
+    occlusion: str | None = None
+    """Replace the protocol's occlusion rule, for example by none. Such runs never share a table with the protocol's."""
+    keep: tuple[str, ...] = ()
+    """Switches that the plan must not change for this scene; "all" keeps everything."""
+    force: bool = False
+    """Run again even if the same run is done."""
+    json: bool = False
+    """Print one JSON object on stdout and nothing else there."""
+
+
+def main(argv: list[str]) -> int:
+    method, profile = _peek(argv, "--method", "inpainthuman"), _peek(argv, "--profile", "quick")
+    chosen = options(_with_switches(method, profile), argv, "run", "Fit a method under a protocol and score it.")
+    return _run(chosen)
+
+
+def _peek(argv: list[str], flag: str, default: str) -> str:
+    """The value of a flag that decides which other flags exist."""
+    for k, word in enumerate(argv):
+        if word == flag and k + 1 < len(argv):
+            return argv[k + 1]
+        if word.startswith(flag + "="):
+            return word.partition("=")[2]
+    return default
+
+
+def _with_switches(method: str, profile: str) -> type[RunOptions]:
+    """`RunOptions` plus the method's own configuration as `--method.*` flags."""
+    registry.entry_point("method", method)
+    profiles = registry.load("config", method).PROFILES
+    if profile not in profiles:
+        raise BadInput(f"method {method!r}: unknown profile {profile!r}: {registry.nearest(profile, list(profiles))}")
+    config = profiles[profile]
+    switches = Annotated[type(config), tyro.conf.arg(name="method")]
+    return make_dataclass(
+        "RunOptions", [("config", switches, field(default=config))], bases=(RunOptions,), frozen=True
+    )
+
+
+def _run(chosen: Any) -> int:
+    if chosen.device == "cuda":
+        _require_cuda()
+    from dataclasses import replace
+
+    from ihbench.data_source import locate
+    from ihbench.progress import Progress
+    from ihbench.protocol import load_protocol
+    from ihbench.run_loop import RunRequest, run_scene
+
+    protocol = load_protocol(chosen.protocol, chosen.profile)
+    if chosen.occlusion is not None:
+        registry.entry_point("occlusion", chosen.occlusion)
+        protocol = protocol.with_occlusion(chosen.occlusion)
+    if chosen.keep and "all" not in chosen.keep:
+        _check_keep(chosen.keep, chosen.config)
+    source = locate(protocol, chosen.data, chosen.scene)
+    progress = Progress()
+    request = RunRequest(
+        protocol, chosen.method, chosen.config, 0, chosen.device, chosen.runs, chosen.body, chosen.force, chosen.keep
+    )
+    results = []
+    for scene in source.scenes:
+        for seed in chosen.seed:
+            progress.say(f"{protocol.name} {scene}: {chosen.method}, {chosen.profile} profile, seed {seed}")
+            results.append(run_scene(replace(request, seed=seed), source, scene, progress))
+    text = registry.load("report", "md")(results)
+    if chosen.json:
+        print(json.dumps(_as_json(results), allow_nan=False))
+    else:
+        print(text)
+        for result in results:
+            print(f"{result.scene}: {result.folder / 'contact_sheet.png' if result.status == 'done' else result.folder}")
+    return 0 if all(result.status == "done" for result in results) else 1
+
+
+def _as_json(results: list[Any]) -> dict[str, Any]:
+    from ihbench.atomic import encode
+
+    return {
+        "status": "done" if all(r.status == "done" for r in results) else "not done",
+        "runs": [
+            {
+                "folder": str(r.folder),
+                "scene": r.scene,
+                "method": r.method,
+                "seed": r.identity["seed"],
+                "status": r.status,
+                "reason": r.record["reason"],
+                "standin": r.record["about"]["standin"],
+                "scores": {
+                    row: {identity: encode(mean.value) for identity, mean in means.items()} for row, means in r.rows.items()
+                },
+                "fit_seconds": r.record["about"].get("fit_seconds"),
+                "total_seconds": r.record["about"].get("total_seconds"),
+                "peak_mb": r.record["about"].get("peak_mb"),
+            }
+            for r in results
+        ],
+    }
+
+
+def _check_keep(keep: tuple[str, ...], config: Any) -> None:
+    from dataclasses import fields
+
+    known = [f.name for f in fields(config)]
+    for name in keep:
+        if name not in known:
+            raise BadInput(f"--keep {name}: no such switch: {registry.nearest(name, known)}")
+
+
+def _require_cuda() -> None:
+    import torch
+
+    if not torch.cuda.is_available():
+        raise BadInput("--device cuda: torch sees no CUDA device here; leave --device out to fit on the CPU")

@@ -1,0 +1,115 @@
+"""Where a protocol's captures come from: the user's own copy, or the stand-in that is made once and kept."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from ihbench import registry
+from ihbench.body import Body, load_body
+from ihbench.errors import BadInput
+from ihbench.progress import Progress
+from ihbench.protocol import Protocol
+from ihbench.scene import Capture, Dataset
+
+STANDIN_SEED = 0
+
+
+def cache_folder() -> Path:
+    """`IHBENCH_CACHE`, or `ihbench` in the user's cache folder."""
+    own = os.environ.get("IHBENCH_CACHE")
+    if own:
+        return Path(own)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ihbench"
+
+
+def own_data(data: Path | None) -> Path | None:
+    """The user's copy: `--data`, else `IHBENCH_DATA`, else None. Raises `BadInput` when it is not a folder."""
+    named = data or (Path(os.environ["IHBENCH_DATA"]) if os.environ.get("IHBENCH_DATA") else None)
+    if named is not None and not named.is_dir():
+        raise BadInput(f"data folder {named}: does not exist; give the folder of your copy with --data or IHBENCH_DATA")
+    return named
+
+
+@dataclass(frozen=True)
+class DataSource:
+    """The captures a protocol runs on."""
+
+    protocol: Protocol
+    root: Path  # where they lie, or will lie
+    is_standin: bool  # made by the bench for this protocol
+    scenes: tuple[str, ...]
+
+    def open(self, scene: str, body: Path | None, progress: Progress) -> tuple[Capture, Body]:
+        """One capture and the body model of its poses. Makes the stand-in's missing images first."""
+        if self.is_standin:
+            self.make_standin([scene], progress)
+        return open_capture(self.protocol.dataset, self.root, scene, body)
+
+    def make_standin(self, scenes: list[str], progress: Progress) -> None:
+        """Write what the protocol needs of these stand-in subjects and is not there yet."""
+        standin = registry.load("stand-in", self.protocol.dataset)
+        standin.ensure(self.root, STANDIN_SEED, scenes, wanted_frames(self.protocol, standin), progress)
+
+    def exists(self, scene: str) -> bool:
+        """Whether the capture is on disk (for a stand-in: whether a run has made it before)."""
+        try:
+            return scene in registry.load("dataset", self.protocol.dataset)(self.root).subjects()
+        except BadInput:
+            return False
+
+
+def locate(protocol: Protocol, data: Path | None, scenes: tuple[str, ...]) -> DataSource:
+    """Find the data of a protocol. No `scenes` means all that the protocol names (of a user's copy: those present).
+
+    Raises `BadInput` for unknown scenes, with the nearest known one.
+    """
+    root = own_data(data)
+    if root is not None:
+        found = registry.load("dataset", protocol.dataset)(root).subjects()
+        known = [s for s in protocol.subjects if s in found] or found
+        return DataSource(protocol, root, False, _chosen(scenes, known, found, f"in {root}"))
+    if protocol.dataset not in registry.names("stand-in"):
+        raise BadInput(f"protocol {protocol.name}: data set {protocol.dataset!r} has no stand-in; give your copy with --data")
+    known = list(protocol.standin_subjects)
+    # a new generator or body makes other people: they get a folder of their own instead of a refusal
+    made_by = f"v{registry.load('stand-in', protocol.dataset).version}-{load_body().content_sha()[:6]}"
+    root = cache_folder() / "standin" / f"{protocol.dataset}-{made_by}-seed{STANDIN_SEED}"
+    return DataSource(protocol, root, True, _chosen(scenes, known, known, "of the stand-in (no --data given)"))
+
+
+def open_capture(dataset: str, root: Path, scene: str, body: Path | None) -> tuple[Capture, Body]:
+    """Open one capture with the body its poses belong to.
+
+    The bench's own body for stand-ins; for real data the SMPL file at `body` or `IHBENCH_BODY`. Raises `BadInput`
+    when that is missing.
+    """
+    source = registry.load("dataset", dataset)(root)
+    capture = source.open(scene)
+    if capture.body == "procedural":
+        return capture, load_body()
+    named = body or (Path(os.environ["IHBENCH_BODY"]) if os.environ.get("IHBENCH_BODY") else None)
+    if named is None:
+        raise BadInput(
+            f"{dataset} {scene}: its poses need the SMPL model file (SMPL_NEUTRAL.pkl, from smpl.is.tue.mpg.de); "
+            f"name it with --body or IHBENCH_BODY"
+        )
+    model = load_body(named)
+    return source.open(scene, body=model), model
+
+
+def wanted_frames(protocol: Protocol, standin: type) -> dict[int, list[int]]:
+    """Camera index -> frames that a protocol reads of every stand-in subject."""
+    n_frames, n_cameras = standin.n_frames, standin.n_cameras
+    wanted = {protocol.train_camera: protocol.training_frames("", n_frames)}
+    for camera in protocol.testing_cameras(n_cameras):
+        wanted[camera] = sorted({*wanted.get(camera, []), *protocol.testing_frames("", n_frames)})
+    return wanted
+
+
+def _chosen(scenes: tuple[str, ...], known: list[str], found: list[str], where: str) -> tuple[str, ...]:
+    for scene in scenes:
+        if scene not in found:
+            raise BadInput(f"unknown scene {scene!r} {where}: {registry.nearest(scene, found)}")
+    return scenes or tuple(known)

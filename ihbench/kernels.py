@@ -1,0 +1,395 @@
+"""Work-precision of the bench's own kernels: milliseconds and error against the slow twin, for every back end.
+
+Behind `ihbench kernels`. A kernel is an entry of `KERNELS`: a function from the number of repetitions to table rows.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import platform
+import re
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench.camera import Camera, look_at
+from ihbench.errors import BadInput
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+Row = dict[str, Any]
+REPEATS = 15
+UNSTABLE = 0.25  # a spread above this share of the median is marked
+SPLAT_CASES = (("5k@128", 5_000, 128), ("20k@256", 20_000, 256), ("50k@512", 50_000, 512), ("200k@512", 200_000, 512))
+NO_GRADIENT = 1e-12  # a scene of clamped alphas has gradients of 1e-30; they mean 0
+WINDOW = 64  # px; side of the window in which the float64 twin is drawn
+
+
+def run_kernels(names: Sequence[str] | None = None, as_json: bool = False, repeats: int = REPEATS) -> list[Row]:
+    """Measure the kernels called `names` (all of them by default) and print the result; returns its rows.
+
+    Prints a table, or with `as_json` one JSON object {"machine": …, "rows": […]}. A row has kernel, case, backend,
+    the median and the interquartile range of the timings in ms (None where the kernel has no backward pass), the
+    memory the work needs beside its input in MiB, the errors against the twin, and `unstable`.
+
+    Raises BadInput for an unknown name or fewer than one repetition.
+    """
+    unknown = sorted(set(names or ()) - set(KERNELS))
+    if unknown:
+        raise BadInput(f"kernel {unknown[0]!r}: expected one of {', '.join(sorted(KERNELS))}")
+    if repeats < 1:
+        raise BadInput(f"kernel repetitions: expected at least 1, got {repeats}")
+    rows = [row for name in (names or KERNELS) for row in KERNELS[name](repeats)]
+    machine = describe_machine()
+    if as_json:
+        print(json.dumps({"machine": machine, "rows": rows}))
+    else:
+        _print_table(machine, rows)
+    return rows
+
+
+# ----------------------------------------------------------------------------------------------------
+# Splats
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """A scene for the splat renderer."""
+
+    means: Tensor  # [N, 3] m
+    scales: Tensor  # [N] m
+    colors: Tensor  # [N, 3]
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class SplatErrors:
+    """A splat back end against the float64 twin; `at_threshold` is about the pixels that the rest leaves out."""
+
+    image: float  # largest absolute error of colour and alpha
+    gradient: dict[str, float]  # per tensor: norm of the difference over the norm
+    gradient_element: dict[str, float]  # per tensor: largest |difference| / max(|value|, rms of the tensor)
+    at_threshold: float  # share of pixels with an alpha so near a threshold that rounding decides
+    image_at_threshold: float  # largest error there beyond what the splats at the threshold may cause
+
+
+def body_gaussians(count: int, size: int, seed: int = 0) -> Gaussians:
+    """A standing figure of six capsules with `count` Gaussians on its surface, seen by a size² camera, float32.
+
+    It covers about a sixth of the image; a scale is about the distance between neighbours.
+    """
+    import torch
+
+    # (centre of one end, centre of the other end) m, radius m: torso, head, legs, arms
+    ends = np.array(
+        [
+            [(0.0, 0.55, 0.0), (0.0, 0.05, 0.0)],
+            [(0.0, 0.75, 0.0), (0.0, 0.78, 0.0)],
+            [(0.1, 0.0, 0.0), (0.13, -0.8, 0.0)],
+            [(-0.1, 0.0, 0.0), (-0.13, -0.8, 0.0)],
+            [(0.2, 0.5, 0.0), (0.5, 0.1, 0.05)],
+            [(-0.2, 0.5, 0.0), (-0.5, 0.1, 0.05)],
+        ]
+    )
+    radius = np.array([0.13, 0.1, 0.075, 0.075, 0.05, 0.05])
+    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    area = 2 * np.pi * radius * (length + 2 * radius)
+
+    rng = np.random.default_rng(seed)
+    part = rng.choice(len(radius), count, p=area / area.sum())
+    axis = (ends[part, 1] - ends[part, 0]) / length[part, None]
+    # a capsule's surface seen along its axis has the area of a cylinder over the same interval
+    along = rng.uniform(-1, 1, count) * (length[part] / 2 + radius[part])
+    over = np.clip(np.abs(along) - length[part] / 2, 0, None)
+    direction = rng.normal(size=(count, 3))
+    direction -= (direction * axis).sum(1, keepdims=True) * axis
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    means = ends[part].mean(1) + along[:, None] * axis
+    means += np.sqrt(np.maximum(radius[part] ** 2 - over**2, 0))[:, None] * direction
+    scales = np.sqrt(area.sum() / count) * rng.uniform(0.7, 1.1, count)
+
+    R, t = look_at(np.array([0.5, 0.2, 2.1]), np.zeros(3))
+    focal = 1.03 * size
+    camera = Camera(np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]]), R, t, size, size)
+    means, scales, colors = (
+        torch.tensor(a, dtype=torch.float32) for a in (means, scales, rng.uniform(size=(count, 3)))
+    )
+    return Gaussians(means, scales, colors, camera)
+
+
+def compare_with_twin(
+    scene: Gaussians,
+    backend: str,
+    background: Sequence[float] = (1.0, 1.0, 1.0),
+    seed: int = 0,
+    tolerance: float = 1e-4,
+) -> SplatErrors:
+    """A back end's image and gradients against the float64 twin's, for random gradients of colour and alpha.
+
+    Pixels with an alpha within `tolerance` of a threshold get no gradient, so that they are left out of the gradients
+    of both; their colours are compared apart, each such splat being allowed one ALPHA_MIN.
+    """
+    import torch
+
+    from ihbench.render.splat import ALPHA_MIN, project_gaussians, render_gaussians
+    from ihbench.render.splat_reference import alphas_near_threshold
+
+    inputs = (scene.means, scene.scales, scene.colors)
+    camera = scene.camera
+    near = alphas_near_threshold(project_gaussians(*inputs, camera), camera.height, camera.width, tolerance)
+    generator = torch.Generator(device="cpu").manual_seed(seed)
+    pull_rgb = torch.randn(*near.shape, scene.colors.shape[1], generator=generator, dtype=torch.float64)
+    pull_alpha = torch.randn(*near.shape, generator=generator, dtype=torch.float64)
+    device = scene.means.device
+    pull_rgb, pull_alpha = (pull_rgb.to(device) * (near == 0)[..., None], pull_alpha.to(device) * (near == 0))
+
+    def draw(which: str, dtype: torch.dtype) -> tuple[Tensor, list[Tensor]]:
+        leaves = [x.detach().to(dtype).requires_grad_() for x in inputs]
+        rgb, alpha = render_gaussians(leaves[0], leaves[1], leaves[2], camera, background, which)
+        gradients = torch.autograd.grad([rgb, alpha], leaves, [pull_rgb.to(dtype), pull_alpha.to(dtype)])
+        return torch.cat([rgb, alpha[..., None]], -1).detach().double(), [g.double() for g in gradients]
+
+    image, gradients = draw(backend, scene.means.dtype)
+    true_image, true_gradients = draw("reference", torch.float64)
+    error = (image - true_image).abs().amax(-1)
+    names = ("means", "scales", "colors")
+    pairs = list(zip(gradients, true_gradients, strict=True))
+    excess = (error - near * ALPHA_MIN)[near > 0]
+    return SplatErrors(
+        image=float(error[near == 0].max()) if (near == 0).any() else 0.0,
+        gradient={n: _norm_error(g, truth) for n, (g, truth) in zip(names, pairs, strict=True)},
+        gradient_element={n: _element_error(g, truth) for n, (g, truth) in zip(names, pairs, strict=True)},
+        at_threshold=float((near > 0).double().mean()),
+        image_at_threshold=max(0.0, float(excess.max())) if len(excess) else 0.0,
+    )
+
+
+def _norm_error(value: Tensor, truth: Tensor) -> float:
+    """|value - truth| / |truth|, where a gradient under NO_GRADIENT counts as none."""
+    return float((value - truth).norm() / truth.norm().clamp(min=NO_GRADIENT))
+
+
+def _element_error(value: Tensor, truth: Tensor) -> float:
+    """Largest |value - truth| / max(|truth|, rms of truth), where a gradient under NO_GRADIENT counts as none."""
+    if truth.numel() == 0:
+        return 0.0
+    floor = max(float(truth.square().mean().sqrt()), NO_GRADIENT)
+    return float(((value - truth).abs() / truth.abs().clamp(min=floor)).max())
+
+
+def splat_rows(repeats: int, cases: Sequence[tuple[str, int, int]] = SPLAT_CASES) -> list[Row]:
+    """Every splat back end that can run here, on every case; the twin is timed once, on the smallest."""
+    import torch
+
+    from ihbench.render.splat import render_gaussians
+
+    rows = []
+    for case, count, size in cases:
+        scene = body_gaussians(count, size)
+        on = {"cpu": scene}
+        if torch.cuda.is_available():
+            on["cuda"] = Gaussians(scene.means.cuda(), scene.scales.cuda(), scene.colors.cuda(), scene.camera)
+        backends = [b for b, package in (("numba", "numba"), ("gsplat", "gsplat")) if find_spec(package) is not None]
+        backends = [b for b in backends if b != "gsplat" or "cuda" in on]
+
+        def step(backend: str, scenes: dict[str, Gaussians] = on) -> tuple[float, float]:
+            scene = scenes["cuda" if backend == "gsplat" else "cpu"]
+            leaves = [x.detach().requires_grad_() for x in (scene.means, scene.scales, scene.colors)]
+            pull = torch.ones(scene.camera.height, scene.camera.width, 3, device=scene.means.device)
+            _synchronize(scene.means)
+            start = time.perf_counter()
+            rgb, _ = render_gaussians(leaves[0], leaves[1], leaves[2], scene.camera, backend=backend)
+            _synchronize(rgb)
+            middle = time.perf_counter()
+            rgb.backward(pull)
+            _synchronize(rgb)
+            return (middle - start) * 1e3, (time.perf_counter() - middle) * 1e3
+
+        timings = _interleave({b: lambda b=b: step(b) for b in backends}, repeats)
+        if case == cases[0][0]:
+            timings |= _interleave({"reference": lambda: step("reference")}, 1, warm_up=0)
+        for backend, samples in timings.items():
+            errors = None
+            if backend != "reference":
+                place = on["cuda" if backend == "gsplat" else "cpu"]
+                errors = compare_with_twin(_window(place), backend)
+            rows.append(
+                {
+                    "kernel": "splat",
+                    "case": case,
+                    "backend": backend,
+                    **_summary(samples),
+                    "peak_mib": _peak_mib(lambda b=backend: step(b)) if backend == "numba" else None,
+                    "value_error": errors.image if errors else 0.0,
+                    "gradient_error": max(errors.gradient.values()) if errors else 0.0,
+                }
+            )
+    return rows
+
+
+def _window(scene: Gaussians) -> Gaussians:
+    """The same scene through a small window at the edge of the figure's torso, where the twin takes seconds."""
+    size = scene.camera.width
+    side = min(WINDOW, size)
+    corner = min(int(0.38 * size), size - side)
+    return replace(scene, camera=scene.camera.cropped(corner, corner, side, side))
+
+
+def _synchronize(tensor: Tensor) -> None:
+    if tensor.is_cuda:
+        import torch
+
+        torch.cuda.synchronize(tensor.device)
+
+
+# ----------------------------------------------------------------------------------------------------
+# Z-buffer
+
+
+def zbuffer_rows(repeats: int, cases: Sequence[tuple[str, int, int]] = (("14k faces@512", 83, 512),)) -> list[Row]:
+    """The mesh z-buffer: numba against numpy, which define one function; the value error is the depth's, in m."""
+    from ihbench.render.zbuffer import rasterize
+
+    rows = []
+    for case, rings, size in cases:
+        points, faces = _sphere(rings, size)
+        backends = ["numpy", *(["numba"] if find_spec("numba") is not None else [])]
+
+        def step(backend: str, points=points, faces=faces, size=size) -> tuple[float, None]:
+            start = time.perf_counter()
+            rasterize(points, faces, size, size, backend)
+            return (time.perf_counter() - start) * 1e3, None
+
+        timings = _interleave({b: lambda b=b: step(b) for b in backends}, repeats)
+        truth = rasterize(points, faces, size, size, "numpy")
+        for backend, samples in timings.items():
+            raster = rasterize(points, faces, size, size, backend)
+            both = truth.mask & raster.mask
+            error = float(np.abs(raster.depth[both] - truth.depth[both]).max())
+            rows.append(
+                {
+                    "kernel": "zbuffer",
+                    "case": case,
+                    "backend": backend,
+                    **_summary(samples),
+                    "peak_mib": _peak_mib(lambda b=backend: step(b)),
+                    "value_error": error if (truth.face == raster.face).all() else float("inf"),
+                    "gradient_error": None,
+                }
+            )
+    return rows
+
+
+def _sphere(rings: int, size: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """A sphere that fills a size² image: projected points [V, 3] (px, px, m) and faces [2 rings (rings - 1), 3]."""
+    polar, azimuth = np.meshgrid(np.linspace(0, np.pi, rings), np.linspace(0, 2 * np.pi, rings + 1), indexing="ij")
+    points = np.stack([np.sin(polar) * np.cos(azimuth), np.cos(polar), np.sin(polar) * np.sin(azimuth)], -1)
+    points = points.reshape(-1, 3) * (0.45 * size, 0.45 * size, 0.5) + (0.5 * size, 0.5 * size, 3.0)
+    corner = np.arange(rings * (rings + 1)).reshape(rings, rings + 1)
+    a, b, c, d = (x.ravel() for x in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]))
+    return points, np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
+
+
+KERNELS: dict[str, Callable[[int], list[Row]]] = {"splat": splat_rows, "zbuffer": zbuffer_rows}
+
+
+# ----------------------------------------------------------------------------------------------------
+# Measuring
+
+Sample = tuple[float, float | None]  # ms forward, ms backward
+
+
+def _interleave(steps: dict[str, Callable[[], Sample]], repeats: int, warm_up: int = 2) -> dict[str, list[Sample]]:
+    """Time the steps in turn, so that a change of the machine's load meets all of them."""
+    for step in steps.values():
+        for _ in range(warm_up):
+            step()
+    timings: dict[str, list[Sample]] = {name: [] for name in steps}
+    for _ in range(repeats):
+        for name, step in steps.items():
+            timings[name].append(step())
+    return timings
+
+
+def _summary(samples: list[Sample]) -> Row:
+    """Median and interquartile range of forward and backward."""
+    row: Row = {"repeats": len(samples), "unstable": False}
+    for k, name in enumerate(("forward", "backward")):
+        values = [sample[k] for sample in samples]
+        if None in values:
+            row |= {f"{name}_ms": None, f"{name}_iqr_ms": None}
+            continue
+        low, median, high = np.percentile(np.array(values, dtype=np.float64), [25, 50, 75])
+        row |= {f"{name}_ms": float(median), f"{name}_iqr_ms": float(high - low)}
+        row["unstable"] |= bool(high - low > UNSTABLE * median)
+    return row
+
+
+def _peak_mib(step: Callable[[], object]) -> float | None:
+    """Memory that a step needs while it runs, in MiB; None where the system cannot say (not Linux with glibc)."""
+    try:
+        ctypes.CDLL(None).malloc_trim(0)  # give back what earlier steps left, or this one would need nothing new
+        Path("/proc/self/clear_refs").write_text("5")  # resets the high-water mark
+        before = _status_kib("VmRSS")
+        step()
+        return max(0.0, (_status_kib("VmHWM") - before) / 1024)
+    except (OSError, AttributeError):
+        return None
+
+
+def _status_kib(field: str) -> int:
+    match = re.search(rf"^{field}:\s+(\d+) kB", Path("/proc/self/status").read_text(), re.MULTILINE)
+    if match is None:
+        raise OSError(f"/proc/self/status: no {field}")
+    return int(match.group(1))
+
+
+def describe_machine() -> Row:
+    """Processor, threads and load: what the milliseconds hold for."""
+    import torch
+
+    model = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        match = re.search(r"^model name\s*:\s*(.+)$", cpuinfo.read_text(), re.MULTILINE)
+        model = match.group(1) if match else model
+    return {
+        "cpu": model,
+        "threads": torch.get_num_threads(),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "load": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
+    }
+
+
+def _print_table(machine: Row, rows: list[Row]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("kernel", "case", "back end", "fwd ms", "bwd ms", "MiB", "error", "grad err", "", pad_edge=False)
+    for row in rows:
+        times = (
+            "–" if row[f"{k}_ms"] is None else f"{row[f'{k}_ms']:.1f}±{row[f'{k}_iqr_ms'] / 2:.1f}"
+            for k in ("forward", "backward")
+        )
+        memory = "–" if row["peak_mib"] is None else f"{row['peak_mib']:.0f}"
+        errors = ("–" if row[k] is None else f"{row[k]:.0e}" for k in ("value_error", "gradient_error"))
+        note = "unstable" if row["unstable"] else ""
+        table.add_row(row["kernel"], row["case"], row["backend"], *times, memory, *errors, note)
+    console = Console()
+    console.print(table)
+    gpu = f", {machine['gpu']}" if machine["gpu"] else ""
+    console.print(f"{machine['cpu']}, {machine['threads']} threads{gpu}, load {machine['load']}")
+    console.print(
+        f"Median ± half the interquartile range; unstable: the range exceeds {UNSTABLE:.0%} of the median. Errors are"
+        f" against the float64 twin in a window of {WINDOW}² px (image: largest; gradient: relative norm); those of"
+        " the z-buffer are its depth's, in m, against numpy."
+    )

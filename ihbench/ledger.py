@@ -1,0 +1,389 @@
+"""The ledger of one run: seconds by stage, the quality-time curve, and what a method needs to go on after a kill.
+
+Every interval of wall time is charged to exactly one chain of stages, the innermost open one and its parents, so
+stages add up to the wall clock by construction. `paused` and `save_state` switch to a chain of their own: evaluation
+and checkpoint writing inside a fit are booked beside the fit, not in it. The fit clock is the time charged to `fit`.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ihbench import machine
+from ihbench.atomic import decode, encode, write_bytes
+
+if TYPE_CHECKING:
+    from ihbench.progress import Progress
+
+FIT = "fit"
+EVALUATE = "evaluate"
+CHECKPOINT = "checkpoint"
+REDONE = "redone"  # fit time that a kill threw away
+CRC_BLANK = b'"payload_crc32":"00000000"'
+SAVE_SHARE = 0.05  # of the time may go into saving states
+STAGE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.+-]*(/[A-Za-z0-9][A-Za-z0-9 _.+-]*)*")
+STATE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,99}")
+
+OnCheckpoint = Callable[[int, float, Any], None]
+
+
+@dataclass
+class Stage:
+    """What one stage has cost so far."""
+
+    seconds: float = 0.0  # wall
+    cpu_seconds: float = 0.0  # all threads of the process
+    peak_mb: float = 0.0  # the process's peak when the stage last ended
+    peak_device_mb: float = 0.0
+    entered: int = 0
+
+
+@dataclass(frozen=True)
+class QualityTimes:
+    """When the quality-time curve is sampled: at `first` seconds of the fit clock, then ever `factor` times later."""
+
+    first: float = 2.0  # s
+    factor: float = 2.0
+
+    def __post_init__(self) -> None:
+        if not self.first > 0 or not self.factor > 1:
+            raise ValueError(f"quality times: expected first > 0 and factor > 1, got {self.first}, {self.factor}")
+
+    def after(self, seconds: float) -> float:
+        """The first sampling time later than `seconds`."""
+        due = self.first
+        while due <= seconds:
+            due *= self.factor
+        return due
+
+
+class Ledger:
+    """Times a run and keeps what is needed to resume it. Without a folder it works in memory. For one thread only.
+
+    `state` is what `state()` gave in an earlier process of the same run; its seconds count on. `on_checkpoint(step,
+    fit_seconds, avatar)` belongs to the run loop: it scores the avatar while the fit clock stands still.
+    """
+
+    def __init__(
+        self,
+        folder: Path | None = None,
+        *,
+        device: str = "cpu",
+        state: Mapping[str, Any] | None = None,
+        on_checkpoint: OnCheckpoint | None = None,
+        quality_times: QualityTimes = QualityTimes(),
+        save_every: float = 20.0,  # s, the least time between two saved states
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        self.folder = None if folder is None else Path(folder)
+        self.device = device
+        self.on_checkpoint = on_checkpoint
+        self.quality_times = quality_times
+        self.save_every = save_every
+        self.events: list[dict[str, Any]] = []
+        self._clock = clock
+        self._stages: dict[str, Stage] = {}
+        self._total = 0.0
+        self._total_cpu = 0.0
+        self._chain: tuple[str, ...] = ()  # open stages, outermost first
+        self._in_memory: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {}
+        self._loaded_clock: float | None = None  # the latest fit clock among the states loaded
+        self._offered_step: int | None = None
+        if state is not None:
+            self._stages = _stages(state["stages"])
+            self._total, self._total_cpu = state["seconds"], state["cpu_seconds"]
+            self.events = list(state["events"])
+        self._last, self._last_cpu = clock(), time.process_time()
+        self._last_save, self._save_cost = self._last, 0.0
+        self._due = quality_times.after(self.fit_seconds)
+
+    # --- time ---
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Charge what happens inside to a stage. Nested names extend the path: `stage1` inside `fit` is `fit/stage1`.
+
+        A name that already begins with the open path is taken as it is, and `fit/stage1` outside any stage opens
+        `fit` as well, so a method may give full paths wherever it is called from. The device is synchronised at both
+        ends. Raises `ValueError` for a name that is no path of plain words.
+        """
+        if not STAGE_NAME.fullmatch(name):
+            raise ValueError(f"stage: expected words joined by /, got {name!r}")
+        parent = self._chain[-1] if self._chain else ""
+        path = name if not parent or name.startswith(parent + "/") else f"{parent}/{name}"
+        cuts = [i for i, letter in enumerate(path + "/") if letter == "/" and i > len(parent)]
+        with self._charging((*self._chain, *(path[:i] for i in cuts))):
+            yield
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Stop the clocks of all open stages and charge what happens inside to `evaluate`."""
+        with self._charging((EVALUATE,)):
+            yield
+
+    @property
+    def fit_seconds(self) -> float:
+        """The fit clock: seconds in `fit`, without evaluation and checkpoints, over all processes of the run."""
+        self._charge()
+        return self._stages[FIT].seconds if FIT in self._stages else 0.0
+
+    @property
+    def seconds(self) -> float:
+        """All wall time of the run so far, over all its processes."""
+        self._charge()
+        return self._total
+
+    @contextmanager
+    def _charging(self, chain: tuple[str, ...]) -> Iterator[None]:
+        """Charge to another chain of stages for a while."""
+        machine.synchronize(self.device)
+        self._charge()
+        before, self._chain = self._chain, chain
+        opened = [path for path in chain if path not in before]
+        for path in opened:
+            self._stages.setdefault(path, Stage()).entered += 1
+        try:
+            yield
+        finally:
+            try:
+                machine.synchronize(self.device)
+            finally:
+                self._charge()
+                self._chain = before
+                for path in opened:
+                    self._stages[path].peak_mb = machine.peak_memory_mb()
+                    self._stages[path].peak_device_mb = machine.peak_device_memory_mb()
+
+    def _charge(self) -> None:
+        """Charge the time since the last charge to the open stages."""
+        now, cpu = self._clock(), time.process_time()
+        passed, cpu_passed = now - self._last, cpu - self._last_cpu
+        self._last, self._last_cpu = now, cpu
+        self._total += passed
+        self._total_cpu += cpu_passed
+        for path in self._chain:
+            self._stages[path].seconds += passed
+            self._stages[path].cpu_seconds += cpu_passed
+
+    # --- quality against time ---
+
+    def offer(self, step: int, avatar: Any, progress: Progress | None = None, force: bool = False) -> bool:
+        """Offer the avatar as it stands at `step` to the quality-time curve; True when it was taken.
+
+        Call it every step: while nothing is due it costs a microsecond. `avatar` is an avatar or, where making one
+        costs something, a function that makes it. `force` is for the end of the fit. The fit clock stands still
+        until the avatar is scored.
+        """
+        if self.on_checkpoint is None or (step == self._offered_step if force else self.fit_seconds < self._due):
+            return False
+        machine.synchronize(self.device)
+        seconds = self.fit_seconds
+        with self.paused(), progress.task(f"scoring step {step}") if progress is not None else nullcontext():
+            made = avatar if hasattr(avatar, "render") or not callable(avatar) else avatar()
+            self.on_checkpoint(step, seconds, made)
+        self._offered_step = step
+        self._due = self.quality_times.after(seconds)
+        return True
+
+    # --- resume ---
+
+    def due_to_save(self) -> bool:
+        """Whether the method should save its state now: `save_every` seconds after the last time, later when saving
+        is slow, so that it never takes more than a twentieth of the time."""
+        return self._clock() - self._last_save >= max(self.save_every, self._save_cost / SAVE_SHARE)
+
+    def save_state(self, name: str, tensors: Mapping[str, Any], meta: Mapping[str, Any]) -> None:
+        """Keep tensors (torch or numpy, any shape) and JSON-able `meta`, with the clock, as checkpoint `name`.
+
+        The file `checkpoints/<name>.safetensors` is replaced whole. The time is booked under `checkpoint`. Raises
+        `BadInput` when the disk is full, `ValueError` for a name that is no plain file name.
+        """
+        if not STATE_NAME.fullmatch(name):
+            raise ValueError(f"checkpoint name: expected letters, digits and _.+-, got {name!r}")
+        start = self._clock()
+        with self._charging((CHECKPOINT,)):
+            if self.folder is None:
+                self._in_memory[name] = _copies(tensors), {"meta": encode(dict(meta)), "clock": self._clocks()}
+            else:
+                data = _pack(tensors, {"meta": encode(dict(meta)), "clock": self._clocks()})
+                write_bytes(self._state_path(name), data)
+        self._last_save = self._clock()
+        self._save_cost = self._last_save - start
+
+    def load_state(self, name: str) -> tuple[dict[str, Any], dict[str, Any]] | None:
+        """Tensors (as they were: torch on the CPU, or numpy) and meta of checkpoint `name`, or None if there is none.
+
+        The fit clock goes on from where it stood when the state was saved (the latest, when several are loaded): work
+        that a kill threw away is booked under `redone`. A file that is truncated or damaged counts as absent, and an
+        event says so.
+        """
+        if not STATE_NAME.fullmatch(name):
+            raise ValueError(f"checkpoint name: expected letters, digits and _.+-, got {name!r}")
+        with self._charging((CHECKPOINT,)):
+            if self.folder is None:
+                if name not in self._in_memory:
+                    return None
+                tensors, record = self._in_memory[name]
+                tensors, clocks = _copies(tensors), _stages(record["clock"])
+            else:
+                file = self._state_path(name)
+                if not file.exists():
+                    return None
+                try:
+                    tensors, record = _unpack(file.read_bytes())
+                    clocks = _stages(record["clock"])
+                except Exception as error:  # whatever a damaged file makes of the reader: the stage starts again
+                    self.event("warning", what=f"checkpoint {name} is damaged, starting that stage again: {error}")
+                    return None
+        self._go_on_from(clocks)
+        return tensors, decode(record["meta"])
+
+    def _state_path(self, name: str) -> Path:
+        assert self.folder is not None
+        return self.folder / "checkpoints" / f"{name}.safetensors"
+
+    def _clocks(self) -> dict[str, Any]:
+        self._charge()
+        return {path: asdict(stage) for path, stage in self._stages.items()}
+
+    def _go_on_from(self, clocks: dict[str, Stage]) -> None:
+        """Set the stages of the fit to what they were when a state was saved; keep the books balanced."""
+        saved = clocks[FIT].seconds if FIT in clocks else 0.0
+        if self._loaded_clock is not None and saved <= self._loaded_clock:
+            return
+        self._loaded_clock = saved
+        now = self._stages.get(FIT, Stage())
+        then = clocks.get(FIT, Stage())
+        lost, lost_cpu = self.fit_seconds - then.seconds, now.cpu_seconds - then.cpu_seconds
+        fit = {path: stage for path, stage in clocks.items() if _root(path) == FIT}
+        self._stages = {path: stage for path, stage in self._stages.items() if _root(path) != FIT} | fit
+        for path in self._chain:
+            self._stages.setdefault(path, Stage())
+        if lost > 0:
+            redone = self._stages.setdefault(REDONE, Stage())
+            redone.seconds += lost
+            redone.cpu_seconds += lost_cpu
+            redone.entered += 1
+        else:
+            self._total -= lost
+            self._total_cpu -= lost_cpu
+        self._due = self.quality_times.after(saved)
+
+    # --- the record ---
+
+    def event(self, kind: str, **data: Any) -> None:
+        """Note something that happened: "warning", "diverged", "resumed", ..., with both clocks."""
+        self.events.append({"kind": kind, "fit_seconds": self.fit_seconds, "seconds": self.seconds, "data": data})
+
+    def state(self) -> dict[str, Any]:
+        """Everything but the checkpoints, as JSON-able data, for the run record and for `Ledger(state=...)`."""
+        return {
+            "stages": self._clocks(),
+            "seconds": self._total,
+            "cpu_seconds": self._total_cpu,
+            "events": list(self.events),
+        }
+
+    def table(self) -> list[dict[str, Any]]:
+        """One row a stage, parents before children, then `other` and `total`.
+
+        The rows of depth 0 above `total` add up to it. `share` is of the total; `peak_mb` is the process's peak when
+        the stage last ended.
+        """
+        self._charge()
+        rows = [_row(path, self._stages[path], self._total) for path in _in_order(self._stages)]
+        top = [stage for path, stage in self._stages.items() if "/" not in path]
+        other = Stage(
+            self._total - sum(stage.seconds for stage in top),
+            self._total_cpu - sum(stage.cpu_seconds for stage in top),
+        )
+        total = Stage(
+            self._total, self._total_cpu, machine.peak_memory_mb(), machine.peak_device_memory_mb(), entered=1
+        )
+        return [*rows, _row("other", other, self._total), _row("total", total, self._total)]
+
+
+def _row(path: str, stage: Stage, total: float) -> dict[str, Any]:
+    share = stage.seconds / total if total > 0 else 0.0
+    return {"stage": path, "depth": path.count("/"), "share": share, **asdict(stage)}
+
+
+def _in_order(paths: Mapping[str, Stage], parent: str = "") -> Iterator[str]:
+    """Paths in the order they were first opened, each followed by what it contains."""
+    for path in paths:
+        if path.rpartition("/")[0] == parent:
+            yield path
+            yield from _in_order(paths, path)
+
+
+def _stages(record: Mapping[str, Any]) -> dict[str, Stage]:
+    return {path: Stage(**values) for path, values in record.items()}
+
+
+def _root(path: str) -> str:
+    return path.partition("/")[0]
+
+
+def _copies(tensors: Mapping[str, Any]) -> dict[str, Any]:
+    """Own, contiguous copies on the CPU: what is written later cannot change, and no two share memory."""
+    out = {}
+    for name, value in tensors.items():
+        if hasattr(value, "detach"):
+            out[name] = value.detach().to("cpu", copy=True).contiguous()
+        elif isinstance(value, np.ndarray):
+            out[name] = np.array(value, order="C")
+        else:
+            raise TypeError(f"checkpoint {name}: expected a tensor or an array, got {type(value).__name__}")
+    return out
+
+
+def _pack(tensors: Mapping[str, Any], record: Mapping[str, Any]) -> bytes:
+    """A safetensors file with the record and a checksum of the payload in its metadata."""
+    values = _copies(tensors)
+    arrays = [name for name, value in values.items() if isinstance(value, np.ndarray)]
+    metadata = {"record": json.dumps({**record, "arrays": arrays}), "payload_crc32": "00000000"}
+    if len(arrays) == len(values):
+        from safetensors.numpy import save
+
+        data = save(values, metadata)
+    else:
+        import torch
+        from safetensors.torch import save as save_torch
+
+        named = {name: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for name, v in values.items()}
+        data = save_torch(named, metadata)
+    crc = zlib.crc32(memoryview(data)[_payload_start(data) :])
+    return data.replace(CRC_BLANK, CRC_BLANK.replace(b"00000000", b"%08x" % crc), 1)
+
+
+def _unpack(data: bytes) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The inverse of `_pack`. Raises `ValueError`, or what the reader raises, when the file is damaged."""
+    start = _payload_start(data)
+    metadata = json.loads(data[8:start])["__metadata__"]
+    if zlib.crc32(memoryview(data)[start:]) != int(metadata["payload_crc32"], 16):
+        raise ValueError("checksum differs")
+    record = json.loads(metadata["record"])
+    arrays = set(record["arrays"])
+    if len(arrays) == len(json.loads(data[8:start])) - 1:
+        from safetensors.numpy import load
+
+        return {name: np.array(value) for name, value in load(data).items()}, record
+    from safetensors.torch import load as load_torch
+
+    values = {name: value.clone() for name, value in load_torch(data).items()}
+    return {name: value.numpy() if name in arrays else value for name, value in values.items()}, record
+
+
+def _payload_start(data: bytes) -> int:
+    """Where the tensors begin: after 8 bytes of header length, little endian, and the header."""
+    return 8 + int.from_bytes(data[:8], "little")

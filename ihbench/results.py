@@ -1,0 +1,88 @@
+"""Finished runs as data: what reports read."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ihbench import atomic
+from ihbench.errors import BadInput
+from ihbench.metrics import Mean, Score, mean_over_frames
+from ihbench.scoring import ViewScores
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """One run folder, read."""
+
+    folder: Path
+    record: dict[str, Any]  # run.json
+    rows: dict[str, dict[str, Mean]]  # row name -> identity -> mean over the scene's test views
+
+    @property
+    def status(self) -> str:
+        return self.record["status"]
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        return self.record["identity"]
+
+    @property
+    def method(self) -> str:
+        return self.identity["method"]
+
+    @property
+    def scene(self) -> str:
+        return self.identity["scene"]
+
+    @property
+    def group(self) -> tuple[str, str, str, str]:
+        """Runs of one group may stand in one table: protocol, its digest, profile, real or stand-in."""
+        about = self.record["about"]
+        return self.identity["protocol"], self.identity["protocol_digest"], self.identity["profile"], about["standin"]
+
+
+def view_rows(row: str, scores: Iterable[ViewScores]) -> list[dict[str, Any]]:
+    """Per-view scores as JSON lines: one object per test view, absent numbers with their reasons."""
+    return [
+        {
+            "row": row,
+            "camera": view.key.camera_id,
+            "frame": view.key.frame,
+            "scores": {identity: score.value for identity, score in view.scores.items()},
+            "absent": {identity: score.reason for identity, score in view.scores.items() if score.absent},
+        }
+        for view in scores
+    ]
+
+
+def mean_rows(lines: Iterable[dict[str, Any]]) -> dict[str, dict[str, Mean]]:
+    """The inverse of `view_rows` up to the mean over views: row -> identity -> mean."""
+    scores: dict[str, dict[str, list[Score]]] = {}
+    for line in lines:
+        for identity, value in line["scores"].items():
+            value = float(value)
+            reason = line["absent"].get(identity, "no reason recorded") if math.isnan(value) else ""
+            scores.setdefault(line["row"], {}).setdefault(identity, []).append(Score(value, identity, reason))
+    return {
+        row: {identity: mean_over_frames(values) for identity, values in by_identity.items()}
+        for row, by_identity in scores.items()
+    }
+
+
+def read_result(folder: Path) -> RunResult:
+    """Read a run folder. Raises `BadInput` when it is none or is damaged."""
+    record = atomic.read_json(folder / "run.json")
+    if not isinstance(record, dict) or not {"identity", "status", "about"} <= record.keys():
+        raise BadInput(f"{folder}: run.json is not a run record of this bench")
+    lines: list[dict[str, Any]] = []
+    for name in ("scores.jsonl", "calibration.jsonl"):
+        if (folder / name).is_file():
+            lines += atomic.read_json_lines(folder / name)
+    try:
+        return RunResult(folder, record, mean_rows(lines))
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise BadInput(f"{folder}: its score files are damaged ({error}); run the same command with --force") from error

@@ -1,0 +1,309 @@
+"""Run folders: one folder for each run, named by what the run is.
+
+    runs/zju_occ@1__377__inpainthuman__quick__s0__1f0c9a4b2e/
+        run.json            identity, config, provenance, machine, ledger, status
+        scores.jsonl        one line for each test view: identity string -> value
+        curve.jsonl         quality-time points
+        renders/  checkpoints/
+
+Two runs are the same run when what affects the answer is the same: protocol, data, method and its configuration,
+seed, body and code. The device and the number of threads move the last bits of a result, not its meaning: they are
+recorded in `run.json`, and do not make another run.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from ihbench import atomic, machine
+from ihbench.errors import BadInput
+from ihbench.ledger import Ledger
+from ihbench.provenance import provenance
+
+SCHEMA_VERSION = 1
+STATUSES = ("running", "done", "diverged", "failed", "interrupted", "skipped", "timeout")
+FINISHED = ("done", "diverged", "skipped")  # running such a run again would end the same way
+HASH_LENGTH = 10
+
+Record = dict[str, Any]
+
+# schema version -> what brings a record of that version to the next one
+MIGRATIONS: dict[int, Callable[[Record], Record]] = {}
+
+
+@dataclass(frozen=True)
+class RunIdentity:
+    """Everything that affects the answer of a run, and nothing else."""
+
+    protocol: str  # id@version
+    protocol_digest: str  # hash of the protocol's content
+    dataset: str
+    scene: str
+    data: str  # which copy of the data: variant, or the stand-in's version and seed
+    method: str
+    config: Mapping[str, Any]  # every switch of the method; JSON-able
+    profile: str
+    seed: int
+    body: str  # hash of the body model
+    code: str  # version of the method's code
+
+    @property
+    def digest(self) -> str:
+        """Hex digits that name this identity; equal for equal identities in any process and on any machine."""
+        canonical = json.dumps(atomic.encode(self), sort_keys=True, separators=(",", ":"), allow_nan=False)
+        return hashlib.sha256(canonical.encode()).hexdigest()[:HASH_LENGTH]
+
+    @property
+    def folder_name(self) -> str:
+        """A file name that cannot leave its folder, whatever the parts are called; the digest keeps it unique."""
+        parts = (self.protocol, self.scene, self.method, self.profile, f"s{self.seed}", self.digest)
+        return "__".join(plain_name(part) for part in parts)
+
+
+def plain_name(text: str) -> str:
+    """Letters, digits and . _ + - @ only, not hidden, 48 at most."""
+    return re.sub(r"[^A-Za-z0-9._+@-]+", "-", text).strip(".-_")[:48].rstrip(".") or "unnamed"
+
+
+class RunFolder:
+    """One run on disk. `create` opens it for writing, `open` for reading."""
+
+    def __init__(self, path: Path, record: Record) -> None:
+        self.path = path
+        self.record = record
+
+    @classmethod
+    def create(
+        cls, runs: Path, identity: RunIdentity, about: Mapping[str, Any] | None = None, force: bool = False
+    ) -> RunFolder:
+        """The folder of this run, new or as an earlier process left it.
+
+        A finished run is found, not begun again (see `finished`); one that was cut short keeps its checkpoints and
+        its ledger, to be resumed. `force` empties the folder first. A damaged run.json is kept beside as
+        run.json.damaged, and the run starts again with a warning. `about` holds what a reader should know and no
+        identity needs (whether the data are a stand-in, the device). Hold `lock()` while writing. Raises `BadInput`
+        when the folder cannot be written, belongs to another run, or to a newer version of this bench.
+        """
+        path = Path(runs) / identity.folder_name
+        if force:
+            with _locked(path):
+                _empty(path)
+        warnings = []
+        if (path / "run.json").exists():
+            try:
+                run = cls.open(path)
+            except DamagedRecord as damage:
+                os.replace(path / "run.json", path / "run.json.damaged")
+                warnings.append(f"run.json was damaged and the run started again: {damage}")
+            else:
+                if run.record["identity"] != _as_read(identity):
+                    raise BadInput(
+                        f"{path}: holds another run under the same name; move that folder away and run again"
+                    )
+                return run
+        run = cls(
+            path,
+            {
+                "schema_version": SCHEMA_VERSION,
+                "status": "running",
+                "reason": "",
+                "digest": identity.digest,
+                "identity": _as_read(identity),
+                "about": dict(about or {}),
+                "created": _now(),
+                "updated": _now(),
+                "provenance": provenance(),
+                "machine": machine.identity(),
+                "ledger": None,
+                "warnings": warnings,
+            },
+        )
+        run.save()
+        return run
+
+    @classmethod
+    def open(cls, path: Path) -> RunFolder:
+        """Read a run folder. Raises `BadInput` when it is none, is damaged, or is of a newer version."""
+        file = Path(path) / "run.json"
+        if not file.is_file():
+            raise BadInput(f"{path}: not a run folder, it has no run.json; expected a folder that ihbench run made")
+        try:
+            record = atomic.read_json(file)
+        except BadInput as error:
+            raise DamagedRecord(str(error)) from error
+        return cls(Path(path), _checked(file, record))
+
+    # --- what it says ---
+
+    @property
+    def identity(self) -> Record:
+        return self.record["identity"]
+
+    @property
+    def status(self) -> str:
+        return self.record["status"]
+
+    @property
+    def reason(self) -> str:
+        return self.record["reason"]
+
+    @property
+    def finished(self) -> bool:
+        """Whether the outcome stands: done, diverged or skipped. Everything else may be continued."""
+        return self.status in FINISHED
+
+    @property
+    def renders(self) -> Path:
+        return self.path / "renders"
+
+    @property
+    def checkpoints(self) -> Path:
+        return self.path / "checkpoints"
+
+    def scores(self) -> list[Record]:
+        """Rows of scores.jsonl; none when nothing was scored. Raises `BadInput` for a damaged file."""
+        return self._rows("scores.jsonl")
+
+    def curve(self) -> list[Record]:
+        """Quality-time points in order. Raises `BadInput` for a damaged file."""
+        return self._rows("curve.jsonl")
+
+    def _rows(self, name: str) -> list[Record]:
+        file = self.path / name
+        return atomic.read_json_lines(file) if file.is_file() else []
+
+    # --- writing ---
+
+    def set_status(self, status: str, reason: str = "", ledger: Ledger | None = None) -> None:
+        """Write the outcome, and the ledger's books with it. Raises `ValueError` for an unknown status."""
+        if status not in STATUSES:
+            raise ValueError(f"run status: expected one of {', '.join(STATUSES)}, got {status!r}")
+        self.record["status"], self.record["reason"] = status, reason
+        if ledger is not None:
+            self.record["ledger"] = {**ledger.state(), "table": ledger.table()}
+        self.save()
+
+    def warn(self, text: str) -> None:
+        """Note something the reader of the result should know; once."""
+        if text not in self.record["warnings"]:
+            self.record["warnings"].append(text)
+            self.save()
+
+    def save(self) -> None:
+        """Write run.json. Machine and versions are those of the process that wrote it last."""
+        self.record["updated"] = _now()
+        atomic.write_json(self.path / "run.json", self.record)
+
+    def restarted(self) -> None:
+        """Mark a run that is continued as running, on this machine with these versions."""
+        self.record["provenance"], self.record["machine"] = provenance(), machine.identity()
+        self.set_status("running")
+
+    def write_scores(self, rows: list[Record]) -> None:
+        """Replace scores.jsonl: one row for each test view."""
+        atomic.write_json_lines(self.path / "scores.jsonl", rows)
+
+    def add_curve_point(self, point: Record) -> None:
+        """Append a quality-time point, `{"step": ..., "seconds": ..., ...}`."""
+        atomic.write_json_lines(self.path / "curve.jsonl", [*self.curve(), point])
+
+    def rewind_curve(self, seconds: float) -> None:
+        """Drop points later than `seconds` on the fit clock: a resumed fit makes them again."""
+        points = self.curve()
+        kept = [point for point in points if point["seconds"] <= seconds]
+        if len(kept) < len(points):
+            atomic.write_json_lines(self.path / "curve.jsonl", kept)
+
+    @contextmanager
+    def lock(self) -> Iterator[None]:
+        """Keep other processes from writing this run, and read again what they may have written before.
+
+        Ask `finished` inside. Raises `BadInput` naming the process that is writing.
+        """
+        with _locked(self.path):
+            for stray in self.path.glob(".*.tmp"):  # left by a process killed while writing
+                stray.unlink(missing_ok=True)
+            self.record = RunFolder.open(self.path).record
+            yield
+
+
+class DamagedRecord(BadInput):
+    """A run.json that is there and cannot be used."""
+
+
+def _checked(file: Path, record: Any) -> Record:
+    """The record brought to this schema version. Raises `BadInput` for a newer one, `DamagedRecord` for no record."""
+    version = record.get("schema_version") if isinstance(record, dict) else None
+    if not isinstance(version, int) or isinstance(version, bool) or version < 1:
+        raise DamagedRecord(f"{file}: not a run record, schema_version is missing; run the same command with --force")
+    if version > SCHEMA_VERSION:
+        raise BadInput(
+            f"{file}: written by a newer ihbench (schema {version}, this one knows {SCHEMA_VERSION}); update ihbench"
+        )
+    while version < SCHEMA_VERSION:
+        record = MIGRATIONS[version](record)
+        version += 1
+    expected = {"status": str, "reason": str, "identity": dict, "about": dict, "created": str, "warnings": list}
+    for key, kind in expected.items():
+        if not isinstance(record.get(key), kind):
+            raise DamagedRecord(f"{file}: {key} is missing or no {kind.__name__}; run the same command with --force")
+    if record["status"] not in STATUSES:
+        raise DamagedRecord(f"{file}: unknown status {record['status']!r}; run the same command with --force")
+    return record
+
+
+def _as_read(identity: RunIdentity) -> Record:
+    """The identity as it comes back from JSON, so that the two can be compared."""
+    return atomic.decode(json.loads(json.dumps(atomic.encode(identity))))
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """The system's own file lock: it ends with the process however that ends, so a stale one is never in the way."""
+    import fcntl
+
+    path.mkdir(parents=True, exist_ok=True)
+    with open(path / "lock", "a+", encoding="utf-8") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            file.seek(0)
+            owner = file.read(100).strip() or "another process"
+            raise BadInput(
+                f"{path}: being written by {owner}; wait for it to end, or choose another --runs folder"
+            ) from error
+        file.truncate(0)
+        file.write(f"process {os.getpid()}")
+        file.flush()
+        try:
+            yield
+        finally:
+            file.truncate(0)
+            fcntl.flock(file, fcntl.LOCK_UN)
+
+
+def _empty(path: Path) -> None:
+    """Remove what a run left, but never follow a link out of it, and keep the lock that the caller may hold."""
+    if path.is_symlink():
+        raise BadInput(f"{path}: is a link; --force only empties real run folders, remove the link")
+    for entry in path.iterdir() if path.is_dir() else ():
+        if entry.name == "lock":
+            continue
+        if entry.is_dir() and not entry.is_symlink():
+            shutil.rmtree(entry)
+        else:
+            entry.unlink()
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")

@@ -1,0 +1,241 @@
+"""What makes a run the same run, and a folder that survives kills, rivals and damage."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import fields, replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ihbench import store
+from ihbench.errors import BadInput
+from ihbench.ledger import Ledger
+from ihbench.store import RunFolder, RunIdentity
+
+IDENTITY = RunIdentity(
+    protocol="zju_occ@1", protocol_digest="0123456789abcdef", dataset="zju_mocap", scene="377",
+    data="stand-in v1 seed 0", method="inpainthuman", config={"steps": 300, "rate": 1e-3, "levels": (64, 128)},
+    profile="quick", seed=0, body="b0d7", code="1",
+)  # fmt: skip
+
+
+def test_the_folder_is_named_by_what_the_run_is():
+    assert IDENTITY.folder_name == f"zju_occ@1__377__inpainthuman__quick__s0__{IDENTITY.digest}"
+    assert len(IDENTITY.digest) == 10
+
+
+def test_the_digest_is_the_same_in_any_process():
+    # made by: hashlib.sha256(json.dumps({...the eleven fields...}, sort_keys=True, separators=(",", ":")).encode())
+    assert IDENTITY.digest == "01dfcb82a7"
+    reordered = replace(IDENTITY, config=dict(reversed(IDENTITY.config.items())))
+    assert reordered.digest == IDENTITY.digest
+
+
+@pytest.mark.parametrize("field", [field.name for field in fields(RunIdentity)])
+def test_every_field_makes_another_run(field):
+    other = {"config": {**IDENTITY.config, "steps": 301}, "seed": 1}.get(field, "other")
+    assert replace(IDENTITY, **{field: other}).digest != IDENTITY.digest
+
+
+@given(st.text(max_size=300), st.text(max_size=300))
+@settings(deadline=None, derandomize=True, max_examples=200)
+def test_no_name_leaves_its_folder(scene, method):
+    name = replace(IDENTITY, scene=scene, method=method).folder_name
+    assert Path(name).name == name
+    assert name not in (".", "..")
+    assert not name.startswith(".")
+    assert name.isascii()
+    assert name.isprintable()
+    assert len(name) < 250
+
+
+def test_names_that_become_equal_are_still_two_folders():
+    assert replace(IDENTITY, scene="a/b").folder_name != replace(IDENTITY, scene="a b").folder_name
+
+
+def test_a_new_run_is_running_and_says_where_it_came_from(tmp_path):
+    run = RunFolder.create(tmp_path, IDENTITY, about={"standin": "stand-in v1"})
+    record = json.loads((tmp_path / IDENTITY.folder_name / "run.json").read_text())
+    assert record == run.record
+    assert record["schema_version"] == 1
+    assert record["status"] == "running"
+    assert record["identity"]["config"]["levels"] == [64, 128]
+    assert record["about"] == {"standin": "stand-in v1"}
+    assert record["machine"]["cores"] >= 1
+    assert {"ihbench", "git", "packages"} <= record["provenance"].keys()
+    assert not run.finished
+
+
+def test_a_finished_run_is_found_not_made_again(tmp_path):
+    run = RunFolder.create(tmp_path, IDENTITY)
+    ledger = Ledger()
+    with ledger.stage("fit"):
+        pass
+    run.write_scores([{"row": "inpainthuman", "camera": "1", "frame": 0, "scores": {}, "absent": {}}])
+    run.set_status("done", ledger=ledger)
+    again = RunFolder.create(tmp_path, IDENTITY)
+    assert again.finished
+    assert again.scores() == run.scores() != []
+    assert [row["stage"] for row in again.record["ledger"]["table"]] == ["fit", "other", "total"]
+    assert Ledger(state=again.record["ledger"]).seconds >= ledger.state()["stages"]["fit"]["seconds"]
+
+
+@pytest.mark.parametrize("status", store.STATUSES)
+def test_outcomes_keep_their_reason(tmp_path, status):
+    run = RunFolder.create(tmp_path, IDENTITY)
+    run.set_status(status, "because")
+    again = RunFolder.open(run.path)
+    assert (again.status, again.reason) == (status, "because")
+    assert again.finished == (status in ("done", "diverged", "skipped"))
+
+
+def test_an_unknown_status_is_refused(tmp_path):
+    run = RunFolder.create(tmp_path, IDENTITY)
+    with pytest.raises(ValueError, match="finished"):
+        run.set_status("finished")
+
+
+def test_force_begins_again_but_follows_no_links(tmp_path):
+    run = RunFolder.create(tmp_path / "runs", IDENTITY)
+    run.set_status("done")
+    run.write_scores([{"a": 1}])
+    run.renders.mkdir()
+    (tmp_path / "precious").mkdir()
+    (tmp_path / "precious" / "file").write_text("x")
+    (run.path / "link").symlink_to(tmp_path / "precious")
+    fresh = RunFolder.create(tmp_path / "runs", IDENTITY, force=True)
+    assert fresh.status == "running"
+    assert sorted(entry.name for entry in fresh.path.iterdir()) == ["lock", "run.json"]
+    assert (tmp_path / "precious" / "file").read_text() == "x"
+
+
+def test_force_does_not_empty_a_run_in_use(tmp_path):
+    run = RunFolder.create(tmp_path, IDENTITY)
+    run.write_scores([{"a": 1}])
+    with run.lock(), pytest.raises(BadInput, match="being written"):
+        RunFolder.create(tmp_path, IDENTITY, force=True)
+    assert run.scores() == [{"a": 1}]
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", "{}", '{"schema_version": 1}', '{"schema_version": "1"}'])
+def test_a_damaged_record_is_said_on_reading_and_started_again_on_writing(tmp_path, content):
+    run = RunFolder.create(tmp_path, IDENTITY)
+    run.checkpoints.mkdir()
+    (run.path / "run.json").write_text(content)
+    with pytest.raises(BadInput, match=r"run\.json") as caught:
+        RunFolder.open(run.path)
+    assert "\n" not in str(caught.value)
+    again = RunFolder.create(tmp_path, IDENTITY)
+    assert again.status == "running"
+    assert "damaged" in again.record["warnings"][0]
+    assert (run.path / "run.json.damaged").read_text() == content
+    assert run.checkpoints.is_dir()
+
+
+def test_a_record_of_a_newer_version_is_left_alone(tmp_path):
+    run = RunFolder.create(tmp_path, IDENTITY)
+    run.record["schema_version"] = 2
+    run.save()
+    before = (run.path / "run.json").read_bytes()
+    for attempt in (lambda: RunFolder.open(run.path), lambda: RunFolder.create(tmp_path, IDENTITY)):
+        with pytest.raises(BadInput, match="newer"):
+            attempt()
+    assert (run.path / "run.json").read_bytes() == before
+
+
+def test_older_records_are_brought_up_step_by_step(tmp_path, monkeypatch):
+    run = RunFolder.create(tmp_path, IDENTITY)
+    monkeypatch.setattr(store, "SCHEMA_VERSION", 3)
+    monkeypatch.setattr(
+        store, "MIGRATIONS", {1: lambda r: {**r, "seen": [1]}, 2: lambda r: {**r, "seen": [*r["seen"], 2]}}
+    )
+    assert RunFolder.open(run.path).record["seen"] == [1, 2]
+
+
+def test_another_run_under_the_same_name_is_not_overwritten(tmp_path):
+    run = RunFolder.create(tmp_path, IDENTITY)
+    run.record["identity"]["config"]["steps"] = 999
+    run.save()
+    with pytest.raises(BadInput, match="another run"):
+        RunFolder.create(tmp_path, IDENTITY)
+
+
+def test_a_folder_without_a_record_is_no_run(tmp_path):
+    with pytest.raises(BadInput, match="not a run folder"):
+        RunFolder.open(tmp_path)
+
+
+def test_the_curve_grows_and_can_be_rewound(tmp_path):
+    run = RunFolder.create(tmp_path, IDENTITY)
+    assert run.curve() == []
+    for seconds in (2.0, 4.0, 8.0):
+        run.add_curve_point({"step": int(seconds), "seconds": seconds, "scores": {"psnr": float("inf")}})
+    run.rewind_curve(4.0)
+    assert [point["step"] for point in run.curve()] == [2, 4]
+    assert run.curve()[0]["scores"]["psnr"] == float("inf")
+
+
+def test_warnings_are_kept_once(tmp_path):
+    run = RunFolder.create(tmp_path, IDENTITY)
+    run.warn("slow")
+    run.warn("slow")
+    assert RunFolder.open(run.path).record["warnings"] == ["slow"]
+
+
+# --- locks ---
+
+HOLD = (
+    "import sys, time; from pathlib import Path; from ihbench.store import RunFolder\n"
+    "with RunFolder.open(Path(sys.argv[1])).lock():\n"
+    "    print('held', flush=True); time.sleep(60)"
+)
+
+
+def test_two_processes_cannot_write_one_run_and_a_dead_one_is_not_in_the_way(tmp_path):
+    run = RunFolder.create(tmp_path, IDENTITY)
+    with subprocess.Popen([sys.executable, "-c", HOLD, str(run.path)], stdout=subprocess.PIPE) as rival:
+        assert rival.stdout is not None
+        assert rival.stdout.readline() == b"held\n"
+        with pytest.raises(BadInput, match=f"process {rival.pid}"), run.lock():
+            pass
+        rival.send_signal(signal.SIGKILL)
+        rival.wait()
+    assert (run.path / "lock").read_text() == f"process {rival.pid}"  # what the dead one left
+    with run.lock():
+        assert (run.path / "lock").read_text() == f"process {os.getpid()}"
+
+
+def test_a_lock_is_released_by_an_error_too(tmp_path):
+    run = RunFolder.create(tmp_path, IDENTITY)
+
+    def fails():
+        with run.lock():
+            raise RuntimeError
+
+    for _ in range(2):
+        with pytest.raises(RuntimeError):
+            fails()
+
+
+def test_the_lock_shows_what_a_rival_finished_meanwhile_and_clears_its_strays(tmp_path):
+    ours, rival = RunFolder.create(tmp_path, IDENTITY), RunFolder.create(tmp_path, IDENTITY)
+    rival.set_status("done")
+    (ours.path / ".scores.jsonl.1.ab.tmp").write_text("half")
+    assert not ours.finished
+    with ours.lock():
+        assert ours.finished
+        assert not list(ours.path.glob(".*.tmp"))
+
+
+def test_importing_the_store_is_cheap():
+    modules = "store, index, atomic, ledger, machine, progress, metrics, provenance"
+    heavy = "{'torch', 'cv2', 'rich', 'numba'}"
+    code = f"import sys; from ihbench import {modules}; assert not {heavy} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)

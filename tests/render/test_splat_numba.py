@@ -1,0 +1,233 @@
+"""The numba renderer against the float64 twin: images to 1e-3, gradients to 1e-3, on everyday and extreme scenes."""
+
+import numba
+import numpy as np
+import pytest
+import torch
+
+from ihbench.kernels import Gaussians, body_gaussians, compare_with_twin
+from ihbench.render import splat_numba, splat_reference
+from ihbench.render.splat import Splats, render_gaussians
+from tests.render.test_splat import front_camera, random_gaussians
+
+
+def scene(n, seed, width, height, scale=(0.02, 0.1), depth=(1.0, 3.0), focal=60.0):
+    rng = np.random.default_rng(seed)
+    z = rng.uniform(*depth, n)
+    x, y = (rng.uniform(-0.7, 0.7, n) * side / focal * z for side in (width, height))
+    scales = np.exp(rng.uniform(np.log(scale[0]), np.log(scale[1]), n))
+    tensors = (np.stack([x, y, z], -1), scales, rng.uniform(size=(n, 3)))
+    return Gaussians(*(torch.tensor(a, dtype=torch.float32) for a in tensors), front_camera(width, height, focal))
+
+
+def coincident():
+    """All at one depth and many at one place: only the index orders them."""
+    s = scene(300, 4, 40, 33)
+    s.means[:, 2] = 2.0
+    s.means[:150] = s.means[150:].clone()
+    return s
+
+
+def behind():
+    """Half behind the camera or near the near plane."""
+    s = scene(400, 5, 50, 40)
+    s.means[::2, 2] = torch.linspace(-1.0, 0.03, 200)
+    return s
+
+
+def stack(n):
+    """n big splats behind one another: the transmittance falls below what float32 holds."""
+    s = scene(n, 6, 48, 48, scale=(0.2, 0.3))
+    s.means[:, :2] *= 0.2
+    return s
+
+
+def border():
+    """Centres on the edges and corners of the image and of the tiles."""
+    s = scene(0, 0, 48, 32)
+    columns, rows = (-0.5, 0, 0.5, 15.5, 16, 16.5, 47.5, 48, 50), (-2, 0, 15.99, 31.5, 32)
+    pixels = np.array([(x, y) for x in columns for y in rows])
+    z = np.linspace(1, 3, len(pixels))
+    means = np.column_stack([(pixels - (24, 16)) / 60 * z[:, None], z])
+    colors = np.random.default_rng(0).uniform(size=(len(z), 3))
+    tensors = (torch.tensor(a, dtype=torch.float32) for a in (means, 0.04 * z, colors))
+    return Gaussians(*tensors, s.camera)
+
+
+SCENES = {
+    "random": lambda: scene(600, 0, 64, 64),
+    "no multiple of 16": lambda: scene(400, 1, 53, 37),
+    "sub-pixel": lambda: scene(2000, 2, 64, 64, scale=(1e-6, 3e-3)),
+    "huge": lambda: scene(40, 3, 40, 40, scale=(0.3, 1e5)),
+    "mixed sizes": lambda: scene(300, 7, 64, 48, scale=(1e-4, 30.0)),
+    "coincident": coincident,
+    "behind": behind,
+    "stack": lambda: stack(300),
+    "border": border,
+    "one": lambda: scene(1, 8, 40, 30),
+    "one pixel": lambda: scene(30, 9, 1, 1),
+    "one row": lambda: scene(60, 10, 70, 1),
+    "one column": lambda: scene(60, 11, 1, 70),
+    "body": lambda: body_gaussians(3000, 96),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_agrees_with_the_twin(name):
+    # a wide splat is nearly flat where it is clamped: only a narrow tolerance leaves pixels to compare
+    tolerance = 1e-5 if name in ("huge", "mixed sizes") else 1e-4
+    errors = compare_with_twin(SCENES[name](), "numba", background=(0.9, 0.4, 0.1), tolerance=tolerance)
+    assert errors.image < 2e-5
+    assert errors.image_at_threshold < 2e-5
+    assert errors.at_threshold < 0.2
+    for tensor in ("means", "scales", "colors"):
+        assert errors.gradient[tensor] < 1e-4, tensor
+        assert errors.gradient_element[tensor] < 1e-3, tensor
+
+
+def test_one_enormous_splat():
+    """Its gradients are beyond float32; its picture is not."""
+    color = torch.tensor([[0.1, 0.2, 0.3]])
+    s = Gaussians(torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([1e6]), color, front_camera())
+    errors = compare_with_twin(s, "numba")
+    assert errors.image < 1e-6
+    assert errors.gradient["colors"] < 1e-5
+
+
+def test_huge_splats_do_not_fill_the_memory(monkeypatch):
+    """What lies behind splats that cover a tile is not listed: 20 000 × 256 tiles would be 5 million entries."""
+    n = 20_000
+    s = scene(n, 3, 256, 256, scale=(50.0, 60.0))
+    listed = []
+    draw = splat_numba._draw
+
+    def spy(entries, *rest):
+        listed.append(len(entries))
+        return draw(entries, *rest)
+
+    monkeypatch.setattr(splat_numba, "_draw", spy)
+    with torch.no_grad():
+        rgb, alpha = render_gaussians(s.means, s.scales, s.colors, s.camera, backend="numba")
+    assert 256 <= listed[0] < 50 * 256
+    assert (alpha > 0.998).all()
+    front = int(s.means[:, 2].argmin())
+    assert torch.allclose(rgb[128, 128], s.colors[front], atol=2e-3)
+
+
+def test_no_grad_stores_no_transmittances(monkeypatch):
+    s = body_gaussians(500, 48)
+    kept = []
+    draw = splat_numba._draw
+
+    def spy(*args):
+        kept.append(next(a for a in args if isinstance(a, np.ndarray) and a.shape[1:] == (256,)).size)
+        return draw(*args)
+
+    monkeypatch.setattr(splat_numba, "_draw", spy)
+    leaves = [x.clone().requires_grad_() for x in (s.means, s.scales, s.colors)]
+    with torch.no_grad():
+        render_gaussians(*leaves, s.camera, backend="numba")
+    render_gaussians(*leaves, s.camera, backend="numba")
+    render_gaussians(s.means, s.scales, s.colors, s.camera, backend="numba")
+    assert kept[0] == kept[2] == 0 < kept[1]
+
+
+def test_the_thread_count_changes_nothing():
+    s = body_gaussians(4000, 128)
+
+    def draw():
+        leaves = [x.clone().requires_grad_() for x in (s.means, s.scales, s.colors)]
+        rgb, alpha = render_gaussians(*leaves, s.camera, backend="numba")
+        (rgb.square().sum() + alpha.sum()).backward()
+        return [rgb.detach(), alpha.detach(), *(x.grad for x in leaves)]
+
+    most = numba.get_num_threads()
+    results = []
+    try:
+        for threads in sorted({1, most}):
+            numba.set_num_threads(threads)
+            results += [draw(), draw()]
+    finally:
+        numba.set_num_threads(most)
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+def test_the_shares_of_the_binning_follow_the_depth():
+    """However many splats a share has, a tile's list stays in the order of depth."""
+    for n in (1, 2, 7, 8, 9, 63):
+        errors = compare_with_twin(scene(n, n, 40, 24, scale=(0.1, 0.3)), "numba")
+        assert errors.image < 2e-5
+
+
+def test_depth_order_is_stable_and_complete():
+    rng = np.random.default_rng(0)
+    for spread in (0.0, 1e-6, 1.0, 1e6):
+        depth = (1 + spread * rng.uniform(size=3000).round(2)).astype(np.float32)
+        xy, variance = np.full((3000, 2), 5.0), np.ones(3000)
+        order = splat_numba._depth_order(xy, variance, depth.view(np.uint32), 10, 10, splat_numba.LOG_CUTOFF)
+        assert (order == np.argsort(depth, kind="stable")).all()
+
+
+def test_power_of_half():
+    t = np.concatenate([np.linspace(0, 20, 20001), [1e-30, 0.5, 19.999]]).astype(np.float32)
+    value = np.array([splat_numba._power_of_half(x) for x in t], dtype=np.float64)
+    assert np.abs(value / np.exp2(-t.astype(np.float64)) - 1).max() < 2e-7
+    assert splat_numba._power_of_half(np.float32(0)) == 1
+    assert splat_numba._power_of_half(np.float32(np.inf)) == np.float32(2.0**-20)
+
+
+def test_the_gradient_survives_the_clamp():
+    """Alpha next to ALPHA_MAX in front, where 1 / (1 - alpha) is 1000: both splats' gradients stay right."""
+    xy = torch.tensor([[8.5 + 0.05, 8.5], [9.0, 8.2], [8.0, 8.9]], dtype=torch.float64)
+    variance = torch.tensor([1.2, 6.0, 9.0], dtype=torch.float64)
+    colors = torch.tensor([[0.9, 0.1, 0.2], [0.1, 0.8, 0.3], [0.4, 0.5, 0.9]], dtype=torch.float64)
+    gradients = []
+    for module in (splat_reference, splat_numba):
+        leaves = [x.clone().requires_grad_() for x in (xy, variance, colors)]
+        splats = Splats(leaves[0], leaves[1], torch.tensor([1.0, 2.0, 3.0]), leaves[2])
+        rgb, _ = module.composite(splats, 17, 17, torch.zeros(3))
+        gradients.append(torch.autograd.grad(rgb[8, 8].double().sum(), leaves))
+    for truth, value in zip(*gradients, strict=True):
+        assert torch.allclose(truth, value.double(), rtol=1e-4, atol=1e-9)
+
+
+def test_the_comparison_sees_a_wrong_back_end(monkeypatch):
+    """The helper behind these tests reports each kind of error where it is."""
+    s = Gaussians(*random_gaussians(100), front_camera())
+    original = splat_numba.composite
+
+    def with_image_error(splats, *args):
+        rgb, alpha = original(splats, *args)
+        return rgb + 3e-3, alpha
+
+    def with_gradient_error(splats, *args):
+        colors = splats.colors * 1.01 - splats.colors.detach() * 0.01
+        return original(Splats(splats.xy, splats.variance, splats.depth, colors), *args)
+
+    def with_one_wrong_element(splats, *args):
+        factor = torch.ones(len(splats.variance), dtype=torch.float64)
+        factor[40] = 1.5
+        variance = splats.variance * factor - splats.variance.detach() * (factor - 1)
+        return original(Splats(splats.xy, variance, splats.depth, splats.colors), *args)
+
+    monkeypatch.setattr(splat_numba, "composite", with_image_error)
+    assert compare_with_twin(s, "numba").image == pytest.approx(3e-3, rel=0.01)
+    monkeypatch.setattr(splat_numba, "composite", with_gradient_error)
+    errors = compare_with_twin(s, "numba")
+    assert errors.gradient["colors"] == pytest.approx(0.01, rel=0.01)
+    assert errors.gradient["means"] < 1e-4
+    assert errors.image < 2e-5
+    monkeypatch.setattr(splat_numba, "composite", with_one_wrong_element)
+    errors = compare_with_twin(s, "numba")
+    assert errors.gradient_element["scales"] > 0.05
+    assert errors.image < 2e-5
+
+
+def test_the_comparison_allows_only_the_threshold():
+    """At a pixel where an alpha lies on the threshold, one ALPHA_MIN per such splat is allowed, and no more."""
+    s = Gaussians(*random_gaussians(400), front_camera())
+    loose = compare_with_twin(s, "numba", tolerance=0.2)
+    tight = compare_with_twin(s, "numba")
+    assert loose.at_threshold > 0.2 > tight.at_threshold
+    assert loose.image_at_threshold == tight.image_at_threshold == 0
