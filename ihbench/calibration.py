@@ -74,7 +74,7 @@ class Calibration:
         if row == "truth":
             return view.image
         if row == "truth-8bit":
-            return np.round(view.image * 255).astype(np.uint8).astype(np.float32) / 255
+            return (np.round(view.image * 255).astype(np.uint8) / 255).astype(np.float32)
         if row == "nearest-frame":
             return self._nearest_frame(view.camera, view.body_pose)
         if row == "mean-colour-body":
@@ -92,7 +92,8 @@ class Calibration:
         image[:] = self.background
         hit = raster.mask
         if textured:
-            image[hit] = sample_uv(self.texture, raster.interpolate(self.body.uv, self.body.uv_faces)[hit])
+            uv = raster.interpolate(self.body.uv, self.body.uv_faces)[hit]
+            image[hit] = sample_uv(self.texture, uv.astype(np.float64))
         else:
             image[hit] = self.mean_color
         shape = (camera.height, SUPERSAMPLE, camera.width, SUPERSAMPLE, 3)

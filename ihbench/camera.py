@@ -39,7 +39,9 @@ class Camera:
             raise ValueError(f"camera size: expected at least 1×1 px, got {self.width}×{self.height}")
 
     @classmethod
-    def from_opencv(cls, K: Array, R: Array, t: Array, width: int, height: int, distortion: Array | None = None) -> Camera:
+    def from_opencv(
+        cls, K: Array, R: Array, t: Array, width: int, height: int, distortion: Array | None = None
+    ) -> Camera:
         """A camera from an OpenCV calibration, whose pixel centres are integers; t in metres."""
         K = np.array(K, dtype=np.float64)
         K[:2, 2] += 0.5
@@ -106,7 +108,9 @@ def distort(x: Array, y: Array, coefficients: Array) -> tuple[Array, Array]:
     )
 
 
-def look_at(eye: Array, target: Array, up: Array | tuple[float, float, float] = (0.0, 1.0, 0.0)) -> tuple[Array, Array]:
+def look_at(
+    eye: Array, target: Array, up: Array | tuple[float, float, float] = (0.0, 1.0, 0.0)
+) -> tuple[Array, Array]:
     """R [3, 3], t [3] of a camera at `eye` m that looks at `target` m, with `up` pointing up in the image."""
     eye, target = np.asarray(eye, np.float64), np.asarray(target, np.float64)
     z = target - eye

@@ -11,7 +11,7 @@ from ihbench.body import Body, load_body
 from ihbench.errors import BadInput
 from ihbench.progress import Progress
 from ihbench.protocol import Protocol
-from ihbench.scene import Capture, Dataset
+from ihbench.scene import Capture
 
 STANDIN_SEED = 0
 
@@ -28,7 +28,9 @@ def own_data(data: Path | None) -> Path | None:
     """The user's copy: `--data`, else `IHBENCH_DATA`, else None. Raises `BadInput` when it is not a folder."""
     named = data or (Path(os.environ["IHBENCH_DATA"]) if os.environ.get("IHBENCH_DATA") else None)
     if named is not None and not named.is_dir():
-        raise BadInput(f"data folder {named}: does not exist; give the folder of your copy with --data or IHBENCH_DATA")
+        raise BadInput(
+            f"data folder {named}: does not exist; give the folder of your copy with --data or IHBENCH_DATA"
+        )
     return named
 
 
@@ -71,7 +73,9 @@ def locate(protocol: Protocol, data: Path | None, scenes: tuple[str, ...]) -> Da
         known = [s for s in protocol.subjects if s in found] or found
         return DataSource(protocol, root, False, _chosen(scenes, known, found, f"in {root}"))
     if protocol.dataset not in registry.names("stand-in"):
-        raise BadInput(f"protocol {protocol.name}: data set {protocol.dataset!r} has no stand-in; give your copy with --data")
+        raise BadInput(
+            f"protocol {protocol.name}: data set {protocol.dataset!r} has no stand-in; give your copy with --data"
+        )
     known = list(protocol.standin_subjects)
     # a new generator or body makes other people: they get a folder of their own instead of a refusal
     made_by = f"v{registry.load('stand-in', protocol.dataset).version}-{load_body().content_sha()[:6]}"

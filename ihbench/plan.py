@@ -148,7 +148,10 @@ def expected_seconds(runs: Path, method: str, profile: str) -> float | None:
     for path in runs.glob("*/run.json"):
         try:
             record = read_json(path)
-            if record["status"] == "done" and (record["identity"]["method"], record["identity"]["profile"]) == (method, profile):
+            if record["status"] == "done" and (record["identity"]["method"], record["identity"]["profile"]) == (
+                method,
+                profile,
+            ):
                 seconds.append(float(record["about"]["total_seconds"]))
         except (BadInput, KeyError, TypeError, ValueError):
             continue  # a damaged record tells nothing about time

@@ -108,8 +108,8 @@ class Protocol:
     def covered(self, subject: str, frames: list[int], n_frames: int) -> list[bool]:
         """For each training frame, whether the occluder covers it.
 
-        `of = "sampled"`: the first share of the sampled frames (OccFusion). `of = "raw"`: raw frame numbers below that
-        share of all kept frames (OccNeRF). The two differ, see the field's released readers.
+        `of = "sampled"`: the first share of the sampled frames (OccFusion). `of = "raw"`: raw frame numbers below
+        that share of all kept frames (OccNeRF).
         """
         share = self.occlusion.covers_fraction
         if self.occlusion.covers_of == "sampled":
@@ -127,7 +127,12 @@ class Protocol:
 
 
 def load_protocol(name: str, profile: str = "quick") -> Protocol:
-    """Read a registered protocol under a profile. Raises `BadInput` for unknown names and malformed files."""
+    """Read a registered protocol, or a TOML file of your own, under a profile.
+
+    Raises `BadInput` for unknown names and malformed files.
+    """
+    if name.endswith(".toml"):
+        return read_protocol(Path(name), profile)
     point = registry.entry_point("protocol", name)
     return read_protocol(registry.package_folder("protocol", name) / point.attr, profile)
 
@@ -140,7 +145,9 @@ def read_protocol(path: Path, profile: str = "quick") -> Protocol:
         raise BadInput(f"protocol file {path}: {error}") from error
     profiles = content.pop("profile", {})
     if profile not in profiles:
-        raise BadInput(f"protocol file {path}: unknown profile {profile!r}: {registry.nearest(profile, list(profiles))}")
+        raise BadInput(
+            f"protocol file {path}: unknown profile {profile!r}: {registry.nearest(profile, list(profiles))}"
+        )
     _merge(content, profiles[profile], path)
     try:
         return _build(content, profile)
@@ -167,11 +174,11 @@ def _one_of(value: str, known: tuple[str, ...], what: str) -> str:
 
 
 def _span(table: dict[str, Any], what: str) -> Span:
-    span = Span(table["start"], table["stop"], table["step"])
-    named = isinstance(span.stop, str)
-    if span.start < 0 or span.step < 1 or (named and span.stop != "max_frames") or (not named and span.stop <= span.start):
-        raise ValueError(f"{what} is {table}, expected start >= 0, stop > start (or \"max_frames\"), step >= 1")
-    return span
+    start, stop, step = table["start"], table["stop"], table["step"]
+    ends = stop > start if isinstance(stop, int) else stop == "max_frames"
+    if start < 0 or step < 1 or not ends:
+        raise ValueError(f'{what} is {table}, expected start >= 0, stop > start (or "max_frames"), step >= 1')
+    return Span(start, stop, step)
 
 
 def _build(c: dict[str, Any], profile: str) -> Protocol:

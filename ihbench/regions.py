@@ -39,7 +39,9 @@ class SurfaceMap:
         flat[texels.index] = np.select([visibility.visible, visibility.hidden], [VISIBLE, HIDDEN], NEVER_SEEN)
         return cls(body, flat[chart_padding(texels.mask, size)])
 
-    def regions(self, view: TestView, names: tuple[str, ...], box_padding: float) -> dict[str, NDArray[np.bool_] | str]:
+    def regions(
+        self, view: TestView, names: tuple[str, ...], box_padding: float
+    ) -> dict[str, NDArray[np.bool_] | str]:
         """Masks [H, W] of the named regions; a string instead of a mask says why a region is absent."""
         vertices = self.body.pose(view.body_pose)
         surface = self._surface_labels(vertices, view)
@@ -68,7 +70,7 @@ class SurfaceMap:
         col = np.clip((uv[:, 0] * size).astype(int), 0, size - 1)
         row = np.clip(((1 - uv[:, 1]) * size).astype(int), 0, size - 1)
         labels[hit] = self.labels[row, col]
-        rows, cols = distance_transform_edt(~hit, return_distances=False, return_indices=True)
+        rows, cols = np.asarray(distance_transform_edt(~hit, return_distances=False, return_indices=True))
         return np.where(view.silhouette, labels[rows, cols], 0).astype(np.uint8)
 
 

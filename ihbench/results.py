@@ -85,4 +85,6 @@ def read_result(folder: Path) -> RunResult:
     try:
         return RunResult(folder, record, mean_rows(lines))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise BadInput(f"{folder}: its score files are damaged ({error}); run the same command with --force") from error
+        raise BadInput(
+            f"{folder}: its score files are damaged ({error}); run the same command with --force"
+        ) from error

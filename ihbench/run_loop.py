@@ -1,7 +1,7 @@
 """The run loop: one protocol, scene, method, configuration and seed -> a run folder with scores.
 
-Killed at any moment, the same call goes on at the last saved state and ends with the same numbers. Failure, divergence
-and interruption are outcomes with a reason.
+Killed at any moment, the same call goes on at the last saved state and ends with the same numbers. Failure,
+divergence and interruption are outcomes with a reason.
 """
 
 from __future__ import annotations
@@ -126,10 +126,8 @@ def run_identity(request: RunRequest, capture: Capture, body: Body) -> RunIdenti
     )
 
 
-def load_avatar(
-    folder: Path, data: Path | None, body: Path | None, progress: Progress
-) -> tuple[Any, Body, Callable[[], Capture]]:
-    """The avatar of a finished run, its body, and a function that opens the run's capture for its poses."""
+def load_avatar(folder: Path, data: Path | None, body: Path | None) -> tuple[Any, Callable[[], Capture]]:
+    """The avatar of a run, and a function that opens the run's capture for its poses."""
     record = RunFolder.open(folder).record
     about, identity = record["about"], record["identity"]
     if not (folder / "avatar").is_dir():
@@ -141,13 +139,15 @@ def load_avatar(
         model = load_body(body)
     else:
         raise BadInput(f"{folder}: was fitted on real data; name the SMPL model file with --body")
-    method: Method = registry.load("method", identity["method"])(configuration(identity["method"], identity["profile"], {}))
+    method: Method = registry.load("method", identity["method"])(
+        configuration(identity["method"], identity["profile"], {})
+    )
 
     def capture() -> Capture:
         source = locate(protocol, data, (identity["scene"],))
         return open_capture(protocol.dataset, source.root, identity["scene"], body)[0]
 
-    return method.load(folder / "avatar", model), model, capture
+    return method.load(folder / "avatar", model), capture
 
 
 class _Run:
@@ -212,7 +212,7 @@ class _Run:
         )
         self.folder.set_status("running", ledger=self.ledger)
         method: Method = registry.load("method", request.method)(config)
-        training = TrainingSet(scene.train, self.body, tuple(protocol.image.background), self.capture.name)
+        training = TrainingSet(scene.train, self.body, protocol.image.background, self.capture.name)
         with self.ledger.stage("fit"):
             avatar = method.fit(
                 training, device=request.device, seed=request.seed, ledger=self.ledger, progress=self.progress
@@ -225,7 +225,7 @@ class _Run:
         self.folder.set_status("done", ledger=self.ledger)
 
     def _render(self, avatar: Avatar, view: TestView) -> NDArray[np.float32]:
-        return avatar.render(view.camera, view.body_pose, tuple(self.request.protocol.image.background))[0]
+        return avatar.render(view.camera, view.body_pose, self.request.protocol.image.background)[0]
 
     def _curve_point(self, step: int, seconds: float, avatar: Avatar) -> None:
         """Score a checkpoint on a few fixed test views. The fit clock stands still meanwhile."""
@@ -247,7 +247,7 @@ class _Run:
         lines = atomic.read_json_lines(cached) if cached.is_file() else None
         if lines is None:
             calibration = Calibration.build(
-                scene.train, self.body, self.scorer.texels, tuple(scene.protocol.image.background)
+                scene.train, self.body, self.scorer.texels, scene.protocol.image.background
             )
             rows |= {row: (lambda view, row=row: calibration.predict(row, view)) for row in ROWS}
         on_sheet, sheet = _spread(len(scene.test_keys), SHEET_VIEWS), []
@@ -298,7 +298,7 @@ def _changed(request: RunRequest) -> list[str]:
         for field in fields(base)
         if getattr(request.config, field.name) != getattr(base, field.name)
     ]
-    return changed + [f"keep={','.join(request.keep)}"] if request.keep else changed
+    return [*changed, f"keep={','.join(request.keep)}"] if request.keep else changed
 
 
 def _spread(n: int, k: int) -> list[int]:

@@ -80,12 +80,12 @@ class Scorer:
     def score(self, loaded: LoadedView, image: NDArray[np.float32]) -> ViewScores:
         """Score one image. Raises `BadInput` when it has another size than the test view."""
         if image.shape != loaded.view.image.shape:
-            raise BadInput(f"prediction of {loaded.key.name}: has shape {image.shape}, expected {loaded.view.image.shape}")
+            raise BadInput(
+                f"prediction of {loaded.key.name}: has shape {image.shape}, expected {loaded.view.image.shape}"
+            )
         scores: dict[str, Score] = {}
         for preset in self.scene.protocol.presets:
-            scores |= evaluate(
-                image, loaded.view.image, loaded.regions, preset, tuple(self.scene.protocol.image.background)
-            )
+            scores |= evaluate(image, loaded.view.image, loaded.regions, preset, self.scene.protocol.image.background)
         return ViewScores(loaded.key, scores)
 
     def score_rows(

@@ -35,10 +35,12 @@ def splat_ply(
     return "\n".join(header).encode("ascii") + table.tobytes()
 
 
-def read_splat_ply(data: bytes) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+def read_splat_ply(data: bytes) -> tuple[NDArray, NDArray, NDArray]:
     """means [N, 3], scales [N], colours [N, 3] of a PLY as `splat_ply` writes it."""
     head, _, body = data.partition(b"end_header\n")
-    count = next(int(line.split()[-1]) for line in head.decode("ascii").splitlines() if line.startswith("element vertex"))
+    count = next(
+        int(line.split()[-1]) for line in head.decode("ascii").splitlines() if line.startswith("element vertex")
+    )
     table = np.frombuffer(body, "<f4").reshape(count, len(FIELDS))
     return table[:, :3], np.exp(table[:, 10]), table[:, 6:9] * SH_C0 + 0.5
 

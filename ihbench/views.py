@@ -156,7 +156,9 @@ def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
         default=-1,
     )
     if frames_needed < 0:
-        raise BadInput(f"{capture.dataset} {capture.name}: {protocol.name} selects no frame of its {capture.n_frames}")
+        raise BadInput(
+            f"{capture.dataset} {capture.name}: {protocol.name} selects no frame of its {capture.n_frames}"
+        )
     if frames_needed >= capture.n_frames:
         raise BadInput(
             f"{capture.dataset} {capture.name}: has {capture.n_frames} frames, {protocol.name} needs frame "
@@ -164,7 +166,10 @@ def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
         )
     n_cameras = len(capture.camera_ids)
     if protocol.train_camera >= n_cameras:
-        raise BadInput(f"{capture.dataset} {capture.name}: has {n_cameras} cameras, training needs camera index {protocol.train_camera}")
+        raise BadInput(
+            f"{capture.dataset} {capture.name}: has {n_cameras} cameras, "
+            f"training needs camera index {protocol.train_camera}"
+        )
     occlusion, frames, covered = apply_rule(protocol, capture)
     train_camera = capture.camera(protocol.train_camera)
     hidden = occlusion.hidden(train_camera.height)
@@ -204,7 +209,7 @@ def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
         lens, person = undistort[key.camera], silhouette(key.camera, key.frame)
         image = lens.composite(capture.image(key.camera, key.frame), person)
         return TestView(
-            image.astype(np.float32) / 255,
+            (image / 255).astype(np.float32),
             lens.mask(person),
             lens.camera,
             capture.body_pose(key.frame),

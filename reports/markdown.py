@@ -27,14 +27,20 @@ def _group(key: tuple[str, str, str, str], runs: list[RunResult]) -> str:
     done = [run for run in runs if run.status == "done"]
     kind = f"**{standin}**: made by the bench, not real data" if standin else "real data"
     head = [f"## {protocol}, {profile} profile", "", f"Data: {kind}. Protocol digest `{digest}`."]
-    head += [f"Not done: {run.method} on {run.scene}: {run.status} ({run.record['reason']})." for run in runs if run not in done]
+    head += [
+        f"Not done: {run.method} on {run.scene}: {run.status} ({run.record['reason']})."
+        for run in runs
+        if run not in done
+    ]
     if not done:
         return "\n".join(head)
     identities = [Identity.parse(text) for text in next(iter(done[0].rows.values()))]
     headline = done[0].record["about"]["headline"]
     table = _table(done, identities, headline)
     notes = [f"Mean over test views of a scene, then over scenes ({_scenes(done)}). Headline region: {headline}."]
-    notes += [f"`{identity}`" for identity in sorted({str(i).replace(f"/{i.region}/", "/REGION/") for i in identities})]
+    notes += [
+        f"`{identity}`" for identity in sorted({str(i).replace(f"/{i.region}/", "/REGION/") for i in identities})
+    ]
     notes += [f"- {row}: {DESCRIPTIONS[row]}" for row in ROWS if any(row in run.rows for run in done)]
     notes += sorted({note for run in done for note in _left_out(run)})
     return "\n".join([*head, "", *table, "", *notes])
@@ -45,14 +51,21 @@ def _table(runs: list[RunResult], identities: list[Identity], headline: str) -> 
     regions = list(dict.fromkeys(i.region for i in identities))
     columns = [i for m in metrics for r in regions for i in identities if (i.metric, i.region) == (m, r)]
     head = ["method", "scenes", "seeds"]
-    head += [f"{UNITS[i.metric]}{ARROWS[i.metric]} {'**' + i.region + '**' if i.region == headline else i.region}" for i in columns]
+    head += [
+        f"{UNITS[i.metric]}{ARROWS[i.metric]} {'**' + i.region + '**' if i.region == headline else i.region}"
+        for i in columns
+    ]
     head += ["fit s", "total s", "peak MB"]
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * 3 + "---:|" * (len(head) - 3)]
     by_label: dict[str, list[RunResult]] = {}
     for run in runs:
         by_label.setdefault(_label(run), []).append(run)
     for label, group in by_label.items():
-        cells = [label, str(len({r.scene for r in group})), ", ".join(sorted({str(r.identity["seed"]) for r in group}))]
+        cells = [
+            label,
+            str(len({r.scene for r in group})),
+            ", ".join(sorted({str(r.identity["seed"]) for r in group})),
+        ]
         cells += [_cell([(r.scene, r.rows[r.method]) for r in group], i) for i in columns]
         cells += [_mean_of(group, "fit_seconds"), _mean_of(group, "total_seconds"), _largest(group, "peak_mb")]
         lines.append("| " + " | ".join(cells) + " |")

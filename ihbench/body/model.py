@@ -60,8 +60,8 @@ class Body:
     ) -> tuple[Array, Array]:
         """Vertices [V, 3] m and joints [24, 3] m of the rest pose with the given shape coefficients.
 
-        Read-only arrays. Missing coefficients count as 0; surplus ones must be 0, else `BadInput`: dropping them would make it another
-        person.
+        Read-only arrays. Missing coefficients count as 0; surplus ones must be 0, else `BadInput`: dropping them
+        would make it another person.
         """
         betas = np.asarray(betas, np.float64).reshape(-1)
         known = self.shapedirs.shape[2]

@@ -30,14 +30,13 @@ class ExportOptions:
 
 def main(argv: list[str]) -> int:
     chosen = options(ExportOptions, argv, "export", "An avatar's Gaussians as a standard splat PLY.")
-    from ihbench.progress import Progress
-    from ihbench.run import load_avatar
+    from ihbench.run_loop import load_avatar
     from ihbench.splat_ply import write_splat_ply
 
-    avatar, body, open_scene = load_avatar(chosen.run, chosen.data, chosen.body, Progress())
+    avatar, open_capture = load_avatar(chosen.run, chosen.data, chosen.body)
     if not hasattr(avatar, "gaussians"):
         raise BadInput(f"{chosen.run}: its method has no Gaussians to export")
-    means, scales, colors = avatar.gaussians(_pose(chosen.pose, avatar, open_scene))
+    means, scales, colors = avatar.gaussians(_pose(chosen.pose, avatar, open_capture))
     out = chosen.out or chosen.run / "avatar.ply"
     write_splat_ply(out, means.cpu().numpy(), scales.cpu().numpy(), colors.cpu().numpy())
     print(f"{len(means)} Gaussians in pose {chosen.pose} written to {out}")

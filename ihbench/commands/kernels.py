@@ -20,7 +20,9 @@ class KernelOptions:
 
 
 def main(argv: list[str]) -> int:
-    chosen = options(KernelOptions, argv, "kernels", "Error against the float64 oracle, and milliseconds, per back end.")
+    chosen = options(
+        KernelOptions, argv, "kernels", "Error against the float64 oracle, and milliseconds, per back end."
+    )
     from ihbench.kernels import run_kernels
 
     rows = run_kernels(list(chosen.kernel) or None, chosen.json)

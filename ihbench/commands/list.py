@@ -18,7 +18,9 @@ KINDS = ("methods", "datasets", "protocols", "reports", "metrics")
 
 @dataclass(frozen=True)
 class ListOptions:
-    kind: Annotated[Literal["all", "methods", "datasets", "protocols", "reports", "metrics"], tyro.conf.Positional] = "all"
+    kind: Annotated[
+        Literal["all", "methods", "datasets", "protocols", "reports", "metrics"], tyro.conf.Positional
+    ] = "all"
     """What to list."""
     json: bool = False
     """Print one JSON object on stdout."""

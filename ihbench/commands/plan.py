@@ -69,7 +69,11 @@ def main(argv: list[str]) -> int:
 def _print(report: dict) -> None:
     print(f"{report['method']} under {report['protocol']}, {report['profile']} profile, on {report['data']}")
     seconds = report["expected_seconds_per_scene"]
-    print(f"expected: {seconds:.0f} s per scene, from earlier runs" if seconds else "expected: unknown, no earlier run to go by")
+    print(
+        f"expected: {seconds:.0f} s per scene, from earlier runs"
+        if seconds
+        else "expected: unknown, no earlier run to go by"
+    )
     for scene, found in report["scenes"].items():
         print(f"\n{scene}")
         if "note" in found:
@@ -82,7 +86,8 @@ def _print(report: dict) -> None:
             f"  surface: {m['visible_texels']:.0%} seen, {m['hidden_texels']:.0%} only behind the occluder, "
             f"{m['never_seen_texels']:.0%} never faced the camera"
         )
-        print(f"  joints move up to {m['motion_deg']:.0f}°, the person turns {m['turn_deg']:.0f}°, a pixel is {m['pixel_mm']:.1f} mm")
+        print(f"  joints move up to {m['motion_deg']:.0f}°, the person turns {m['turn_deg']:.0f}°")
+        print(f"  a pixel of the protocol's image covers {m['pixel_mm']:.1f} mm of the body")
         for o in found["left_out"]:
             print(f"  left out: {o['field']} -> {o['value']}: {o['reason']}")
         if not found["left_out"]:

@@ -50,7 +50,11 @@ def main(argv: list[str]) -> int:
 def _show(chosen: Show) -> int:
     protocol = load_protocol(chosen.protocol, chosen.profile)
     if chosen.json:
-        print(json.dumps({**protocol.content, "profile": protocol.profile, "digest": protocol.digest}, ensure_ascii=False))
+        print(
+            json.dumps(
+                {**protocol.content, "profile": protocol.profile, "digest": protocol.digest}, ensure_ascii=False
+            )
+        )
         return 0
     pairs = [*flatten(protocol.content), ("profile", f'"{protocol.profile}"'), ("digest", f'"{protocol.digest}"')]
     width = max(len(key) for key, _ in pairs)

@@ -32,7 +32,9 @@ def main(argv: list[str]) -> int:
 
     folders = chosen.run or tuple(sorted(p.parent for p in chosen.runs.glob("*/run.json")))
     if not folders:
-        raise BadInput(f"no run folders under {chosen.runs}; make one with: ihbench run --protocol zju_occ --scene standin-1")
+        raise BadInput(
+            f"no run folders under {chosen.runs}; make one with: ihbench run --protocol zju_occ --scene standin-1"
+        )
     results = []
     for folder in folders:
         try:

@@ -17,7 +17,7 @@ from ihbench.errors import BadInput
 @dataclass(frozen=True)
 class RunOptions:
     protocol: str
-    """Protocol to run; see `ihbench list protocols`."""
+    """Protocol to run (see `ihbench list protocols`), or the path of a protocol file of your own (.toml)."""
     method: str = "inpainthuman"
     """Method to fit; see `ihbench list methods`."""
     scene: tuple[str, ...] = ()
@@ -35,7 +35,7 @@ class RunOptions:
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to fit."""
     occlusion: str | None = None
-    """Replace the protocol's occlusion rule, for example by none. Such runs never share a table with the protocol's."""
+    """Another occlusion rule than the protocol's, for example none. Never in one table with the protocol's own."""
     keep: tuple[str, ...] = ()
     """Switches that the plan must not change for this scene; "all" keeps everything."""
     force: bool = False
@@ -105,7 +105,9 @@ def _run(chosen: Any) -> int:
     else:
         print(text)
         for result in results:
-            print(f"{result.scene}: {result.folder / 'contact_sheet.png' if result.status == 'done' else result.folder}")
+            print(
+                f"{result.scene}: {result.folder / 'contact_sheet.png' if result.status == 'done' else result.folder}"
+            )
     return 0 if all(result.status == "done" for result in results) else 1
 
 
@@ -124,7 +126,8 @@ def _as_json(results: list[Any]) -> dict[str, Any]:
                 "reason": r.record["reason"],
                 "standin": r.record["about"]["standin"],
                 "scores": {
-                    row: {identity: encode(mean.value) for identity, mean in means.items()} for row, means in r.rows.items()
+                    row: {identity: encode(mean.value) for identity, mean in means.items()}
+                    for row, means in r.rows.items()
                 },
                 "fit_seconds": r.record["about"].get("fit_seconds"),
                 "total_seconds": r.record["about"].get("total_seconds"),

@@ -18,18 +18,24 @@ it, and the tile ends when all are. That changes a colour by less than T_STOP ti
 gradient of an alpha by less than T_STOP / (1 - alpha) times that range.
 
 Nothing depends on the number of threads: a tile's list is in depth order however it was filled, and the gradients of
-a splat are added up tile after tile.
+a splat are added up tile after tile. The threads are Python's (the kernels release the lock), not numba's: numba's
+OpenMP threads and torch's wait for work by spinning, and on a busy machine each kept the other from its core, which
+made an iteration up to twenty times slower.
 """
 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from typing import Any
 
 import numpy as np
 import torch
-from numba import get_num_threads, njit, prange
+from numba import njit
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -37,13 +43,14 @@ from ihbench.render.splat import ALPHA_MAX, ALPHA_MIN, Splats
 
 TILE = 16  # px
 CHUNK = 32  # splats between two stored transmittances
-T_STOP = 1e-5  # a transmittance below it counts as none
+T_STOP = 1e-2  # a transmittance below it counts as none
+PARTS = 32  # the tiles are dealt into as many hands, and the threads take one hand after the other
 SHARES = 8  # parts of the splats that are binned side by side; fixed, so that the threads cannot change the lists
 CHANNELS = 3  # colour channels of one pass; other counts are drawn in several
 
 f32 = np.float32
 # Two things keep the loops over a row vector instructions. Offsets and bounds are unsigned, so that numba leaves out
-# its test for negative indices, which hides that the accesses are consecutive. And where the body is small, the number
+# its test for negative indices, which hides that the accesses are consecutive. And where the body is small, the count
 # of lanes is an argument: a constant would make LLVM unroll the loop into scalars before it looks for vectors.
 u64 = np.uint64
 LANES = u64(TILE)
@@ -93,30 +100,33 @@ class _Composite(torch.autograd.Function):
         colors = colors.detach().float().contiguous().numpy()
         depth = depth.detach().float().contiguous().numpy()
         background = background.float().contiguous().numpy()
-        workers = get_num_threads()
-
         order = _depth_order(xy, variance, depth.view(np.uint32), height, width, LOG_CUTOFF)
         packed = _pack(xy, variance, colors, order, LOG_CUTOFF)
         tiles = -(-height // TILE) * -(-width // TILE)
         cursor, splat_start = np.zeros((SHARES, tiles), np.int64), np.zeros(len(order) + 1, np.int64)
         nothing = np.empty((0, SPLAT), f32), np.empty(0, np.int32)
-        _bin(packed, height, width, ALPHA_MIN, ALPHA_MAX, T_STOP, False, cursor, splat_start, *nothing)
+        limits = ALPHA_MIN, ALPHA_MAX, T_STOP
+        _run(_bin, SHARES, packed, height, width, *limits, False, cursor, splat_start, *nothing)
         tile_start, chunk_start = _offsets(cursor, splat_start)
         total = tile_start[-1]
         if total > np.iinfo(np.int32).max:
             raise MemoryError(f"splats: {total} pairs of splat and tile, more than this back end can index")
         entries, positions = np.empty((total, SPLAT), f32), np.empty(total, np.int32)
-        _bin(packed, height, width, ALPHA_MIN, ALPHA_MAX, T_STOP, True, cursor, splat_start, entries, positions)
+        _run(_bin, SHARES, packed, height, width, *limits, True, cursor, splat_start, entries, positions)
 
         rgb, alpha = torch.empty(height, width, CHANNELS), torch.empty(height, width)
         stored = np.empty((chunk_start[-1] if keep else 0, TILE * TILE), f32)
-        stop = _draw(
-            entries, tile_start, chunk_start, background, f32(ALPHA_MIN), f32(ALPHA_MAX), f32(T_STOP),
-            LANES, keep, stored, rgb.numpy(), alpha.numpy(), workers,
+        stop = np.zeros(tiles, np.int64)
+        tile_order = _busiest_first(tile_start)
+        limits = f32(ALPHA_MIN), f32(ALPHA_MAX), f32(T_STOP)
+        _run(
+            _draw, PARTS, entries, tile_start, chunk_start, tile_order, background, *limits, LANES,
+            keep, stored, stop, rgb.numpy(), alpha.numpy(),
         )  # fmt: skip
         if keep:
             ctx.saved = (
-                order, entries, positions, tile_start, splat_start, chunk_start, stored, stop, background, variance
+                order, entries, positions, tile_start, splat_start, chunk_start, tile_order, stored, stop,
+                background, variance,
             )  # fmt: skip
         return rgb, alpha
 
@@ -124,16 +134,22 @@ class _Composite(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grad_outputs: Any) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         grad_rgb, grad_alpha = grad_outputs
-        order, entries, positions, tile_start, splat_start, chunk_start, stored, stop, background, variance = (
-            ctx.saved
-        )
-        grad_rgb, grad_alpha = grad_rgb.float().contiguous().numpy(), grad_alpha.float().contiguous().numpy()
-        workers = get_num_threads()
-        gradients = _draw_backward(
-            entries, tile_start, chunk_start, stored, stop, background, grad_rgb, grad_alpha,
-            f32(ALPHA_MIN), f32(ALPHA_MAX), f32(T_STOP), LANES, workers,
+        (
+            order, entries, positions, tile_start, splat_start, chunk_start, tile_order, stored, stop,
+            background, variance,
+        ) = ctx.saved  # fmt: skip
+        gradients = np.empty((len(entries), GRADIENT), f32)
+        _run(
+            _draw_backward, PARTS, entries, tile_start, chunk_start, tile_order, stored, stop, background,
+            grad_rgb.float().contiguous().numpy(), grad_alpha.float().contiguous().numpy(),
+            f32(ALPHA_MIN), f32(ALPHA_MAX), f32(T_STOP), LANES, gradients,
         )  # fmt: skip
-        grad_xy, grad_variance, grad_colors = _sum_gradients(gradients, positions, order, splat_start, variance)
+        n = len(variance)
+        grad_xy, grad_variance, grad_colors = np.zeros((n, 2)), np.zeros(n), np.zeros((n, CHANNELS), f32)
+        _run(
+            _sum_gradients, PARTS, gradients, positions, order, splat_start, variance,
+            grad_xy, grad_variance, grad_colors,
+        )  # fmt: skip
         return (
             torch.from_numpy(grad_xy), torch.from_numpy(grad_variance), torch.from_numpy(grad_colors),
             None, None, None, None, None,
@@ -141,6 +157,31 @@ class _Composite(torch.autograd.Function):
 
 
 _composite: Callable[..., tuple[Tensor, Tensor]] = _Composite.apply
+
+
+def _run(kernel: Callable[..., None], parts: int, *args: Any) -> None:
+    """kernel(*args, part) for every part, on as many threads as torch uses; who is free takes the next part."""
+    left = iter(range(parts))
+
+    def work() -> None:
+        for part in left:
+            kernel(*args, part)
+
+    helpers = min(torch.get_num_threads(), parts) - 1
+    futures = [_pool(helpers).submit(work) for _ in range(helpers)]
+    work()
+    for future in futures:
+        if not future.cancel():  # a helper that has not begun yet is not needed any more
+            future.result()
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="splat")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not survive a fork
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -229,9 +270,9 @@ def _band(center, half, size):
     return int(min(max(first, 0.0), tiles)), int(min(max(last, -1.0), tiles - 1)) + 1
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _bin(packed, height, width, alpha_min, alpha_max, t_stop, fill, cursor, splat_start, entries, positions):
-    """Visit every (splat, tile) pair whose circle reaches a pixel centre of the tile.
+@njit(cache=True, nogil=True)
+def _bin(packed, height, width, alpha_min, alpha_max, t_stop, fill, cursor, splat_start, entries, positions, share):
+    """Visit one share's (splat, tile) pair whose circle reaches a pixel centre of the tile.
 
     First call (`fill` false): counts the pairs into `cursor` [SHARES, tiles] and `splat_start` [M + 1]. Second call:
     with both turned into offsets by `_offsets`, writes the tiles' lists `entries` [E, SPLAT] and, splat by splat,
@@ -243,42 +284,41 @@ def _bin(packed, height, width, alpha_min, alpha_max, t_stop, fill, cursor, spla
     """
     m = len(packed)
     tiles_x = (width + TILE - 1) // TILE
-    for share in prange(SHARES):
-        let_through = np.ones(cursor.shape[1], np.float32)  # at most, per tile, by this share's splats so far
-        for rank in range(m * share // SHARES, m * (share + 1) // SHARES):
-            # float32 rounding of the reach must not lose a pixel: the alpha threshold decides in the end
-            x, y, reach_squared = float(packed[rank, 0]), float(packed[rank, 1]), float(packed[rank, 3]) * 1.0001
-            reach = math.sqrt(reach_squared)
-            covers = reach > 4 * TILE  # a smaller splat hides no tile
-            y0, y1 = _band(y, reach, height)
-            touched = 0
-            for ty in range(y0, y1):
-                top = ty * TILE + 0.5
-                dy = max(top - y, y - (top + TILE - 1), 0.0)
-                half = reach
-                if dy > 0:
-                    half = math.sqrt(max(reach_squared - dy * dy, 0.0))
-                x0, x1 = _band(x, half, width)
-                for tx in range(x0, x1):
-                    t = ty * tiles_x + tx
-                    if let_through[t] < t_stop:
-                        continue
-                    if covers:
-                        left = tx * TILE + 0.5
-                        far_x, far_y = max(x - left, left + TILE - 1 - x), max(y - top, top + TILE - 1 - y)
-                        exponent = (far_x * far_x + far_y * far_y) * float(packed[rank, 2]) ** 2
-                        least = math.exp(-exponent / LOG2_E)  # alpha in the corner that is farthest away
-                        if least > 2 * alpha_min:
-                            let_through[t] *= max(1 - least, 1 - alpha_max)
-                    at = cursor[share, t]
-                    cursor[share, t] = at + 1
-                    if fill:
-                        for k in range(SPLAT):
-                            entries[at, k] = packed[rank, k]
-                        positions[splat_start[rank] + touched] = at
-                    touched += 1
-            if not fill:
-                splat_start[rank] = touched
+    let_through = np.ones(cursor.shape[1], np.float32)  # at most, per tile, by this share's splats so far
+    for rank in range(m * share // SHARES, m * (share + 1) // SHARES):
+        # float32 rounding of the reach must not lose a pixel: the alpha threshold decides in the end
+        x, y, reach_squared = float(packed[rank, 0]), float(packed[rank, 1]), float(packed[rank, 3]) * 1.0001
+        reach = math.sqrt(reach_squared)
+        covers = reach > 4 * TILE  # a smaller splat hides no tile
+        y0, y1 = _band(y, reach, height)
+        touched = 0
+        for ty in range(y0, y1):
+            top = ty * TILE + 0.5
+            dy = max(top - y, y - (top + TILE - 1), 0.0)
+            half = reach
+            if dy > 0:
+                half = math.sqrt(max(reach_squared - dy * dy, 0.0))
+            x0, x1 = _band(x, half, width)
+            for tx in range(x0, x1):
+                t = ty * tiles_x + tx
+                if let_through[t] < t_stop:
+                    continue
+                if covers:
+                    left = tx * TILE + 0.5
+                    far_x, far_y = max(x - left, left + TILE - 1 - x), max(y - top, top + TILE - 1 - y)
+                    exponent = (far_x * far_x + far_y * far_y) * float(packed[rank, 2]) ** 2
+                    least = math.exp(-exponent / LOG2_E)  # alpha in the corner that is farthest away
+                    if least > 2 * alpha_min:
+                        let_through[t] *= max(1 - least, 1 - alpha_max)
+                at = cursor[share, t]
+                cursor[share, t] = at + 1
+                if fill:
+                    for k in range(SPLAT):
+                        entries[at, k] = packed[rank, k]
+                    positions[splat_start[rank] + touched] = at
+                touched += 1
+        if not fill:
+            splat_start[rank] = touched
 
 
 @njit(cache=True, nogil=True)
@@ -381,67 +421,63 @@ def _live_rows(T, stride, t_stop, lanes):
     return first, last
 
 
+def _busiest_first(tile_start: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Tiles with work, the longest list first: dealt round in this order, the hands come out even."""
+    load = np.diff(tile_start)
+    order = np.argsort(-load, kind="stable")
+    return order[: np.count_nonzero(load)]
+
+
 @njit(cache=True, nogil=True)
-def _busiest_first(load):
-    """Tiles with work, the longest list first: dealt round the workers in this order, the shares come out even."""
-    busy = np.flatnonzero(load)
-    return busy[np.argsort(-load[busy])]
-
-
-@njit(cache=True, nogil=True, parallel=True)
 def _draw(
-    entries, tile_start, chunk_start, background, alpha_min, alpha_max, t_stop, lanes, store, stored, rgb, alpha,
-    workers,
+    entries, tile_start, chunk_start, tile_order, background, alpha_min, alpha_max, t_stop, lanes,
+    store, stored, stop, rgb, alpha, part,
 ):  # fmt: skip
-    """Fill rgb [H, W, 3] and alpha [H, W]; returns how many entries of each tile were composited."""
+    """Fill one part of rgb [H, W, 3] and alpha [H, W], and of `stop`: how many entries of a tile were composited."""
     height, width = alpha.shape
     tiles_x = (width + TILE - 1) // TILE
-    tiles = len(tile_start) - 1
-    stop = np.zeros(tiles, np.int64)
-    order = _busiest_first(tile_start[1:] - tile_start[:-1])
-    for w in prange(workers):
-        for y in range(height * w // workers, height * (w + 1) // workers):
-            for x in range(width):
-                alpha[y, x] = 0.0
-                for c in range(CHANNELS):
-                    rgb[y, x, c] = background[c]
-    for w in prange(workers):
-        tile = np.empty(TILE * ROW, np.float32)
-        profiles = np.empty(2 * TILE, np.float32)
-        for turn in range(w, len(order), workers):
-            t = order[turn]
-            x0, y0 = t % tiles_x * TILE, t // tiles_x * TILE
-            inside_x, inside_y = min(TILE, width - x0), min(TILE, height - y0)
-            tile[:] = 0.0
-            for q in range(inside_y):
-                for j in range(inside_x):
-                    tile[q * ROW + j] = 1.0
-            first, last = u64(0), LANES
-            drawn = tile_start[t + 1] - tile_start[t]
-            for k in range(drawn):
-                if k % CHUNK == 0:
-                    first, last = _live_rows(tile, ROW, t_stop, lanes)
-                    if first >= last:
-                        drawn = k
-                        break
-                    if store:
-                        chunk = chunk_start[t] + k // CHUNK
-                        for q in range(TILE):
-                            for j in range(TILE):
-                                stored[chunk, q * TILE + j] = tile[q * ROW + j]
-                splat = entries[tile_start[t] + k]
-                x, y = splat[0] - f32(x0) - f32(0.5), splat[1] - f32(y0) - f32(0.5)
-                _profiles(splat[2], x, y, profiles, u64(0))
-                ya, yb = _rows_reached(x, y, splat[3], first, last)
-                _blend(tile, profiles, ya, yb, splat[4], splat[5], splat[6], alpha_min, alpha_max)
-            stop[t] = drawn
-            for q in range(inside_y):
-                for j in range(inside_x):
-                    T = tile[q * ROW + j]
-                    alpha[y0 + q, x0 + j] = f32(1.0) - T
+    for t in range(part, len(stop), PARTS):
+        if tile_start[t] == tile_start[t + 1]:
+            for y in range(t // tiles_x * TILE, min(t // tiles_x * TILE + TILE, height)):
+                for x in range(t % tiles_x * TILE, min(t % tiles_x * TILE + TILE, width)):
+                    alpha[y, x] = 0.0
                     for c in range(CHANNELS):
-                        rgb[y0 + q, x0 + j, c] = tile[q * ROW + (c + 1) * TILE + j] + T * background[c]
-    return stop
+                        rgb[y, x, c] = background[c]
+    tile = np.empty(TILE * ROW, np.float32)
+    profiles = np.empty(2 * TILE, np.float32)
+    for turn in range(part, len(tile_order), PARTS):
+        t = tile_order[turn]
+        x0, y0 = t % tiles_x * TILE, t // tiles_x * TILE
+        inside_x, inside_y = min(TILE, width - x0), min(TILE, height - y0)
+        tile[:] = 0.0
+        for q in range(inside_y):
+            for j in range(inside_x):
+                tile[q * ROW + j] = 1.0
+        first, last = u64(0), LANES
+        drawn = tile_start[t + 1] - tile_start[t]
+        for k in range(drawn):
+            if k % CHUNK == 0:
+                first, last = _live_rows(tile, ROW, t_stop, lanes)
+                if first >= last:
+                    drawn = k
+                    break
+                if store:
+                    chunk = chunk_start[t] + k // CHUNK
+                    for q in range(TILE):
+                        for j in range(TILE):
+                            stored[chunk, q * TILE + j] = tile[q * ROW + j]
+            splat = entries[tile_start[t] + k]
+            x, y = splat[0] - f32(x0) - f32(0.5), splat[1] - f32(y0) - f32(0.5)
+            _profiles(splat[2], x, y, profiles, u64(0))
+            ya, yb = _rows_reached(x, y, splat[3], first, last)
+            _blend(tile, profiles, ya, yb, splat[4], splat[5], splat[6], alpha_min, alpha_max)
+        stop[t] = drawn
+        for q in range(inside_y):
+            for j in range(inside_x):
+                T = tile[q * ROW + j]
+                alpha[y0 + q, x0 + j] = f32(1.0) - T
+                for c in range(CHANNELS):
+                    rgb[y0 + q, x0 + j, c] = tile[q * ROW + (c + 1) * TILE + j] + T * background[c]
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -508,68 +544,63 @@ def _gradient(
     gradients[e, 5] = sum_b
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _draw_backward(
-    entries, tile_start, chunk_start, stored, stop, background, grad_rgb, grad_alpha,
-    alpha_min, alpha_max, t_stop, lanes, workers,
+    entries, tile_start, chunk_start, tile_order, stored, stop, background, grad_rgb, grad_alpha,
+    alpha_min, alpha_max, t_stop, lanes, gradients, part,
 ):  # fmt: skip
-    """[E, GRADIENT]: what each entry of each tile adds to the gradient of its splat."""
+    """Fill one part of `gradients` [E, GRADIENT]: what each entry of each tile adds to the gradient of its splat."""
     height, width = grad_alpha.shape
     tiles_x = (width + TILE - 1) // TILE
-    gradients = np.empty((len(entries), GRADIENT), np.float32)
-    order = _busiest_first(tile_start[1:] - tile_start[:-1])
-    for w in prange(workers):
-        tile = np.empty(TILE * ROW, np.float32)
-        T = np.empty(TILE * TILE, np.float32)
-        weights = np.empty(CHUNK * TILE * TILE, np.float32)
-        profiles = np.empty(CHUNK * 2 * TILE, np.float32)
-        rows = np.empty((CHUNK, 2), np.uint64)
-        sums = np.empty(6 * TILE, np.float32)
-        for turn in range(w, len(order), workers):
-            t = order[turn]
-            x0, y0 = t % tiles_x * TILE, t // tiles_x * TILE
-            tile[:] = 0.0
-            for q in range(min(TILE, height - y0)):
-                for j in range(min(TILE, width - x0)):
-                    seen = -grad_alpha[y0 + q, x0 + j]
-                    for c in range(CHANNELS):
-                        gradient = grad_rgb[y0 + q, x0 + j, c]
-                        tile[q * ROW + (c + 1) * TILE + j] = gradient
-                        seen += gradient * background[c]
-                    tile[q * ROW + j] = seen
-            gradients[tile_start[t] + stop[t] : tile_start[t + 1]] = 0.0
-            chunks = (stop[t] + CHUNK - 1) // CHUNK
-            for chunk in range(chunks - 1, -1, -1):
-                for p in range(TILE * TILE):
-                    T[p] = stored[chunk_start[t] + chunk, p]
-                first, last = _live_rows(T, LANES, t_stop, lanes)
-                begin = tile_start[t] + chunk * CHUNK
-                size = min(CHUNK, stop[t] - chunk * CHUNK)
-                for k in range(size):
-                    splat = entries[begin + k]
-                    x, y = splat[0] - f32(x0) - f32(0.5), splat[1] - f32(y0) - f32(0.5)
-                    _profiles(splat[2], x, y, profiles, u64(k) * PLANE_2)
-                    ya, yb = _rows_reached(x, y, splat[3], first, last)
-                    rows[k, 0], rows[k, 1] = ya, yb
-                    _weigh(T, profiles, u64(k) * PLANE_2, ya, yb, weights, u64(k) * AREA, alpha_min, alpha_max, lanes)
-                for k in range(size - 1, -1, -1):
-                    splat = entries[begin + k]
-                    x, y = splat[0] - f32(x0) - f32(0.5), splat[1] - f32(y0) - f32(0.5)
-                    _gradient(
-                        tile, profiles, u64(k) * PLANE_2, rows[k, 0], rows[k, 1], weights, u64(k) * AREA, x, y,
-                        splat[4], splat[5], splat[6], alpha_min, alpha_max, sums, gradients, begin + k,
-                    )  # fmt: skip
-    return gradients
+    tile = np.empty(TILE * ROW, np.float32)
+    T = np.empty(TILE * TILE, np.float32)
+    weights = np.empty(CHUNK * TILE * TILE, np.float32)
+    profiles = np.empty(CHUNK * 2 * TILE, np.float32)
+    rows = np.empty((CHUNK, 2), np.uint64)
+    sums = np.empty(6 * TILE, np.float32)
+    for turn in range(part, len(tile_order), PARTS):
+        t = tile_order[turn]
+        x0, y0 = t % tiles_x * TILE, t // tiles_x * TILE
+        tile[:] = 0.0
+        for q in range(min(TILE, height - y0)):
+            for j in range(min(TILE, width - x0)):
+                seen = -grad_alpha[y0 + q, x0 + j]
+                for c in range(CHANNELS):
+                    gradient = grad_rgb[y0 + q, x0 + j, c]
+                    tile[q * ROW + (c + 1) * TILE + j] = gradient
+                    seen += gradient * background[c]
+                tile[q * ROW + j] = seen
+        gradients[tile_start[t] + stop[t] : tile_start[t + 1]] = 0.0
+        chunks = (stop[t] + CHUNK - 1) // CHUNK
+        for chunk in range(chunks - 1, -1, -1):
+            for p in range(TILE * TILE):
+                T[p] = stored[chunk_start[t] + chunk, p]
+            first, last = _live_rows(T, LANES, t_stop, lanes)
+            begin = tile_start[t] + chunk * CHUNK
+            size = min(CHUNK, stop[t] - chunk * CHUNK)
+            for k in range(size):
+                splat = entries[begin + k]
+                x, y = splat[0] - f32(x0) - f32(0.5), splat[1] - f32(y0) - f32(0.5)
+                _profiles(splat[2], x, y, profiles, u64(k) * PLANE_2)
+                ya, yb = _rows_reached(x, y, splat[3], first, last)
+                rows[k, 0], rows[k, 1] = ya, yb
+                _weigh(T, profiles, u64(k) * PLANE_2, ya, yb, weights, u64(k) * AREA, alpha_min, alpha_max, lanes)
+            for k in range(size - 1, -1, -1):
+                splat = entries[begin + k]
+                x, y = splat[0] - f32(x0) - f32(0.5), splat[1] - f32(y0) - f32(0.5)
+                _gradient(
+                    tile, profiles, u64(k) * PLANE_2, rows[k, 0], rows[k, 1], weights, u64(k) * AREA, x, y,
+                    splat[4], splat[5], splat[6], alpha_min, alpha_max, sums, gradients, begin + k,
+                )  # fmt: skip
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _sum_gradients(gradients, positions, order, splat_start, variance):
-    """Entries -> gradients of xy [N, 2], variance [N], colors [N, 3]; 0 for splats that no tile has."""
-    n = len(variance)
-    grad_xy = np.zeros((n, 2))
-    grad_variance = np.zeros(n)
-    grad_colors = np.zeros((n, CHANNELS), np.float32)
-    for rank in prange(len(order)):
+@njit(cache=True, nogil=True)
+def _sum_gradients(
+    gradients, positions, order, splat_start, variance, grad_xy, grad_variance, grad_colors, part
+):  # fmt: skip
+    """Entries -> one part of the gradients of xy [N, 2], variance [N], colors [N, 3]."""
+    m = len(order)
+    for rank in range(m * part // PARTS, m * (part + 1) // PARTS):
         i = order[rank]
         gx = gy = gs = r = g = b = 0.0
         for k in range(splat_start[rank], splat_start[rank + 1]):
@@ -586,4 +617,3 @@ def _sum_gradients(gradients, positions, order, splat_start, variance):
         grad_colors[i, 0] = r
         grad_colors[i, 1] = g
         grad_colors[i, 2] = b
-    return grad_xy, grad_variance, grad_colors

@@ -1,4 +1,4 @@
-"""The avatar: Gaussians at the body's UV texels, decoded from UV features, posed by linear blend skinning, splatted."""
+"""The avatar: Gaussians at the body's UV texels, decoded from UV features, posed by skinning, splatted."""
 
 from __future__ import annotations
 
@@ -43,6 +43,8 @@ class GaussianAvatar(nn.Module):
     rest: Tensor
     to_rest: Tensor
     encoded: Tensor
+    residual_index: Tensor
+    residual_weight: Tensor
     base_scale: Tensor
 
     def __init__(self, config: InpaintHumanConfig, body: Body, betas: NDArray[np.float64], seed: int):
@@ -85,7 +87,9 @@ class GaussianAvatar(nn.Module):
             generator,
         )
         width = self.features.out_channels
-        self.decoder = GaussianDecoder(width + encoded.shape[1], config.decoder_width, config.decoder_layers, generator)
+        self.decoder = GaussianDecoder(
+            width + encoded.shape[1], config.decoder_width, config.decoder_layers, generator
+        )
         if config.pose_residual:
             with torch.random.fork_rng(devices=[]):
                 torch.manual_seed(seed)
@@ -116,22 +120,21 @@ class GaussianAvatar(nn.Module):
         positions = root_free_position_map(self.body, body_pose, self.config.position_map)
         return torch.from_numpy(positions).to(self.device)
 
-    def decode(self, points: Tensor, position_map: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Offset [n, 3] m (canonical axes), scale [n] m, colour [n, 3] and canonical feature [n, C] of some points."""
+    def decode(self, points: Tensor, position_map: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Offset [n, 3] m (canonical axes), scale [n] m and colour [n, 3] of some points (eq. 1)."""
         feature = self.features(points)
-        combined = feature
         if self.residual_on and position_map is not None:
-            combined = feature + embedding_bag(
+            feature = feature + embedding_bag(
                 self.residual_index[points],
                 self.encoder(position_map),
                 per_sample_weights=self.residual_weight[points],
                 mode="sum",
             )
-        raw_offset, raw_scale, color = self.decoder(torch.cat([combined, self.encoded[points]], 1))
+        raw_offset, raw_scale, color = self.decoder(torch.cat([feature, self.encoded[points]], 1))
         config = self.config
         offset = config.offset_scale * (torch.tanh(raw_offset) if config.offset == "tanh" else raw_offset)
         scale = self.base_scale[points] * scale_factor(raw_scale, config.scale_activation)
-        return offset, scale.clamp(max=config.scale_limit), color, feature
+        return offset, scale.clamp(max=config.scale_limit), color
 
     def pose_points(self, points: Tensor, offset: Tensor, transforms: Tensor) -> Tensor:  # transforms [24, 3, 4]
         """World positions [n, 3] m of canonical points with offsets, by linear blend skinning (eq. 2)."""
@@ -173,7 +176,7 @@ class GaussianAvatar(nn.Module):
         """World means [n, 3] m, scales [n] m and colours [n, 3] in a pose."""
         points = self.every_point if points is None else points
         position_map = self.position_map(body_pose) if self.residual_on else None
-        offset, scale, color, _ = self.decode(points, position_map)
+        offset, scale, color = self.decode(points, position_map)
         return self.pose_points(points, offset, self.transforms(body_pose)), scale, color
 
     def render(
@@ -225,7 +228,9 @@ class GaussianAvatar(nn.Module):
         if words.get("kind") != "inpainthuman":
             raise BadInput(f"{folder}: holds an avatar of kind {words.get('kind')!r}, expected 'inpainthuman'")
         if words["body"] != body.content_sha():
-            raise BadInput(f"{folder}: was fitted on another body ({words['body']}) than the one given ({body.content_sha()})")
+            raise BadInput(
+                f"{folder}: was fitted on another body ({words['body']}) than the one given ({body.content_sha()})"
+            )
         config = {k: tuple(v) if isinstance(v, list) else v for k, v in words["config"].items()}
         avatar = cls(InpaintHumanConfig(**config), body, np.array(words["betas"]), seed=0)
         avatar.load_state_dict(tensors)

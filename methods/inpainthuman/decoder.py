@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -24,13 +25,13 @@ class GaussianDecoder(nn.Module):
 
     def __init__(self, in_features: int, width: int, layers: int, generator: torch.Generator):
         super().__init__()
-        sizes = [in_features] + [width] * (layers - 1) + [7]
-        self.linear = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes[:-1], sizes[1:], strict=True))
-        for layer in self.linear:
+        linear = [nn.Linear(a, b) for a, b in pairwise([in_features, *[width] * (layers - 1), 7])]
+        for layer in linear:
             bound = 1 / math.sqrt(layer.in_features)
             nn.init.uniform_(layer.weight, -bound * math.sqrt(3), bound * math.sqrt(3), generator=generator)
             nn.init.zeros_(layer.bias)
-        nn.init.zeros_(self.linear[-1].weight)
+        nn.init.zeros_(linear[-1].weight)
+        self.linear = nn.ModuleList(linear)
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Raw outputs: offset [n, 3], scale [n], colour [n, 3] in [0, 1]."""

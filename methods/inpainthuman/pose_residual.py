@@ -45,12 +45,10 @@ class ResidualEncoder(nn.Module):
         super().__init__()
         widths = (base, base * 2, base * 4, base * 4)
         self.down = nn.ModuleList(_block(a, b) for a, b in zip((3, *widths[:-1]), widths, strict=True))
-        self.up = nn.ModuleList(
-            _block(a + b, b) for a, b in zip(widths[:0:-1], widths[-2::-1], strict=True)
-        )
+        self.up = nn.ModuleList(_block(a + b, b) for a, b in zip(widths[:0:-1], widths[-2::-1], strict=True))
         self.last = nn.Conv2d(base, channels_out, 1)
-        nn.init.zeros_(self.last.weight)
-        nn.init.zeros_(self.last.bias)
+        for parameter in self.last.parameters():
+            nn.init.zeros_(parameter)
 
     def forward(self, positions: Tensor) -> Tensor:  # [3, R, R] m
         """Residual feature map as a table [R², C], row-major."""

@@ -61,8 +61,13 @@ def body_window(camera: Camera, vertices: np.ndarray) -> tuple[int, int, int, in
         return 0, 0, camera.width, camera.height
     low, high = p[:, :2].min(0), p[:, :2].max(0)
     pad = MARGIN * (high - low).max()
-    x0, y0 = (int(np.clip(np.floor(v - pad), 0, limit - 1)) for v, limit in zip(low, (camera.width, camera.height), strict=True))
-    x1, y1 = (int(np.clip(np.ceil(v + pad), 1, limit)) for v, limit in zip(high, (camera.width, camera.height), strict=True))
+    x0, y0 = (
+        int(np.clip(np.floor(v - pad), 0, limit - 1))
+        for v, limit in zip(low, (camera.width, camera.height), strict=True)
+    )
+    x1, y1 = (
+        int(np.clip(np.ceil(v + pad), 1, limit)) for v, limit in zip(high, (camera.width, camera.height), strict=True)
+    )
     return x0, y0, max(x1 - x0, 1), max(y1 - y0, 1)
 
 
@@ -73,7 +78,7 @@ def loss_of(avatar: GaussianAvatar, target: Target, background: tuple[float, flo
     as much as one wrong person pixel, whatever the window's size.
     """
     config = avatar.config
-    offset, scale, color, feature = avatar.decode(target.points, target.position_map)
+    offset, scale, color = avatar.decode(target.points, target.position_map)
     means = avatar.pose_points(target.points, offset, target.transforms)
     rgb, _ = render_gaussians(means, scale, color, target.camera, background)
     error = (rgb - target.image).abs()
@@ -101,7 +106,9 @@ class Stage1:
             {"params": list(avatar.decoder.parameters()), "lr": config.lr_decoder, "weight_decay": 0.01},
         ]
         if config.pose_residual:
-            groups.append({"params": list(avatar.encoder.parameters()), "lr": config.lr_encoder, "weight_decay": 0.01})
+            groups.append(
+                {"params": list(avatar.encoder.parameters()), "lr": config.lr_encoder, "weight_decay": 0.01}
+            )
         self.rates = [group["lr"] for group in groups]
         self.optimizer = torch.optim.AdamW(groups, fused=True)
         self.names = {id(p): name for name, p in avatar.named_parameters()}
@@ -131,7 +138,9 @@ class Stage1:
     def _require_visible_pixels(self) -> None:
         shows = any((view.mask == MaskState.PERSON).any() for view in self.training.views)
         if not shows:
-            raise BadInput(f"scene {self.training.name}: no training view shows a visible person pixel; nothing to fit")
+            raise BadInput(
+                f"scene {self.training.name}: no training view shows a visible person pixel; nothing to fit"
+            )
 
     def _view_of(self, step: int, n: int) -> int:
         """Every view once an epoch, in an order that depends on seed and epoch alone, so a resumed run repeats it."""

@@ -52,7 +52,12 @@ def test_look_at_is_a_rotation_with_up_in_the_upper_image_half():
 
 @pytest.mark.parametrize(
     ("change", "word"),
-    [({"K": np.eye(2)}, "K"), ({"t": np.array([0, np.nan, 0])}, "t"), ({"width": 0}, "size"), ({"distortion": np.zeros(4)}, "distortion")],
+    [
+        ({"K": np.eye(2)}, "K"),
+        ({"t": np.array([0, np.nan, 0])}, "t"),
+        ({"width": 0}, "size"),
+        ({"distortion": np.zeros(4)}, "distortion"),
+    ],
 )
 def test_wrong_shapes_and_values_are_refused_by_name(change, word):
     good = {"K": np.eye(3), "R": np.eye(3), "t": np.zeros(3), "width": 4, "height": 4}

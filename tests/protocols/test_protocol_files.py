@@ -20,7 +20,14 @@ def test_zju_occ_trains_on_100_frames_of_which_80_are_covered():
 
 @pytest.mark.parametrize(
     ("subject", "covered", "pairs"),
-    [("377", 456, 418), ("386", 432, 396), ("387", 432, 396), ("392", 444, 418), ("393", 526, 484), ("394", 380, 352)],
+    [
+        ("377", 456, 418),
+        ("386", 432, 396),
+        ("387", 432, 396),
+        ("392", 444, 418),
+        ("393", 526, 484),
+        ("394", 380, 352),
+    ],
 )
 def test_zju_occ_occnerf_counts(subject, covered, pairs):
     protocol = load_protocol("zju_occ_occnerf", "paper")
@@ -30,8 +37,13 @@ def test_zju_occ_occnerf_counts(subject, covered, pairs):
 
 
 def test_the_two_readings_disagree_on_exactly_two_strips():
-    changed = {key for key, _, _ in difference(load_protocol("zju_occ", "paper"), load_protocol("zju_occ_occnerf", "paper"))}
-    assert {key for key in changed if key.startswith("occlusion.strips.")} == {"occlusion.strips.387", "occlusion.strips.394"}
+    changed = {
+        key for key, _, _ in difference(load_protocol("zju_occ", "paper"), load_protocol("zju_occ_occnerf", "paper"))
+    }
+    assert {key for key in changed if key.startswith("occlusion.strips.")} == {
+        "occlusion.strips.387",
+        "occlusion.strips.394",
+    }
     assert "occlusion.covers.of" in changed
 
 

@@ -1,6 +1,7 @@
 """The numba renderer against the float64 twin: images to 1e-3, gradients to 1e-3, on everyday and extreme scenes."""
 
-import numba
+import multiprocessing
+
 import numpy as np
 import pytest
 import torch
@@ -120,7 +121,8 @@ def test_no_grad_stores_no_transmittances(monkeypatch):
     draw = splat_numba._draw
 
     def spy(*args):
-        kept.append(next(a for a in args if isinstance(a, np.ndarray) and a.shape[1:] == (256,)).size)
+        if args[-1] == 0:  # once per image, not once per part
+            kept.append(next(a for a in args if isinstance(a, np.ndarray) and a.shape[1:] == (256,)).size)
         return draw(*args)
 
     monkeypatch.setattr(splat_numba, "_draw", spy)
@@ -141,14 +143,14 @@ def test_the_thread_count_changes_nothing():
         (rgb.square().sum() + alpha.sum()).backward()
         return [rgb.detach(), alpha.detach(), *(x.grad for x in leaves)]
 
-    most = numba.get_num_threads()
+    before = torch.get_num_threads()
     results = []
     try:
-        for threads in sorted({1, most}):
-            numba.set_num_threads(threads)
-            results += [draw(), draw()]
+        for threads in (1, 2, 5):
+            torch.set_num_threads(threads)
+            results.append(draw())
     finally:
-        numba.set_num_threads(most)
+        torch.set_num_threads(before)
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
@@ -167,6 +169,48 @@ def test_depth_order_is_stable_and_complete():
         xy, variance = np.full((3000, 2), 5.0), np.ones(3000)
         order = splat_numba._depth_order(xy, variance, depth.view(np.uint32), 10, 10, splat_numba.LOG_CUTOFF)
         assert (order == np.argsort(depth, kind="stable")).all()
+
+
+def test_an_error_in_a_thread_is_raised():
+    def kernel(part):
+        if part == 17:
+            raise RuntimeError("part 17")
+
+    with pytest.raises(RuntimeError, match="part 17"):
+        splat_numba._run(kernel, 32)
+
+
+def test_every_part_runs_once_on_any_number_of_threads():
+    before = torch.get_num_threads()
+    try:
+        for threads in (1, 2, 7):
+            torch.set_num_threads(threads)
+            done = []
+            splat_numba._run(done.append, 32)
+            assert sorted(done) == list(range(32))
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_drawing_goes_on_after_a_fork():
+    """A data loader's forked worker has none of the parent's threads and must not wait for them."""
+    s = body_gaussians(500, 48)
+    here, _ = render_gaussians(s.means, s.scales, s.colors, s.camera, backend="numba")
+    context = multiprocessing.get_context("fork")
+    queue = context.SimpleQueue()
+    child = context.Process(target=_draw_and_put, args=(queue, s))
+    child.start()
+    child.join(60)
+    assert child.exitcode == 0
+    assert np.array_equal(queue.get(), here.numpy())
+
+
+def _draw_and_put(queue, s):
+    # torch's own OpenMP threads do not survive the fork either
+    torch.set_num_threads(1)
+    rgb, _ = render_gaussians(s.means, s.scales, s.colors, s.camera, backend="numba")
+    splat_numba._run(lambda part: None, 32)
+    queue.put(rgb.numpy())
 
 
 def test_power_of_half():
