@@ -1,3 +1,20 @@
 """ihbench measures how well a method rebuilds an occluded person as an animatable 3D avatar."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
 __version__ = "0.1.0"
+__all__ = ["load_scene", "run"]
+
+if TYPE_CHECKING:
+    from ihbench.run_loop import load_scene, run
+
+
+def __getattr__(name: str) -> Any:
+    """`ihbench.run` and `ihbench.load_scene`, imported at first use."""
+    if name in __all__:
+        from ihbench import run_loop
+
+        return getattr(run_loop, name)
+    raise AttributeError(f"module 'ihbench' has no attribute {name!r}")

@@ -83,6 +83,22 @@ def run(
     return run_scene(request, source, scene, progress or Progress())
 
 
+def load_scene(
+    protocol: str = "zju_occ",
+    scene: str = "standin-1",
+    *,
+    profile: str = "quick",
+    data: Path | str | None = None,
+    body: Path | str | None = None,
+    progress: Progress | None = None,
+) -> tuple[OccludedScene, Body]:
+    """Training and test views of one scene under a protocol, loaded lazily, and the body model of its poses."""
+    chosen = load_protocol(protocol, profile)
+    source = locate(chosen, None if data is None else Path(data), (scene,))
+    capture, model = source.open(scene, None if body is None else Path(body), progress or Progress())
+    return open_scene(capture, chosen), model
+
+
 def configuration(method: str, profile: str, switches: dict[str, Any]) -> Any:
     """A method's configuration under a profile, with some fields replaced. Raises `BadInput` for unknown fields."""
     registry.entry_point("method", method)

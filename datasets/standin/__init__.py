@@ -1,0 +1,1 @@
+"""Stand-ins: procedural people filmed in a data set's own layout."""

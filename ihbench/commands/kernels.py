@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -25,7 +24,5 @@ def main(argv: list[str]) -> int:
     )
     from ihbench.kernels import run_kernels
 
-    rows = run_kernels(list(chosen.kernel) or None, chosen.json)
-    if chosen.json:
-        print(json.dumps(rows))
+    run_kernels(chosen.kernel, chosen.json)
     return 0

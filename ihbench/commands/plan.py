@@ -3,35 +3,15 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import asdict
 
 from ihbench import registry
 from ihbench.commands.parse import options
-
-
-@dataclass(frozen=True)
-class PlanOptions:
-    protocol: str
-    """Protocol to plan."""
-    method: str = "inpainthuman"
-    """Method to plan."""
-    scene: tuple[str, ...] = ()
-    """Scenes; none means all of the protocol's."""
-    profile: str = "quick"
-    """quick or paper."""
-    data: Path | None = None
-    """Your copy of the data set; without it (and without IHBENCH_DATA) the stand-in."""
-    body: Path | None = None
-    """SMPL model file for real data (or IHBENCH_BODY)."""
-    runs: Path = Path("runs")
-    """Where earlier runs lie: expected times come from them."""
-    json: bool = False
-    """Print one JSON object on stdout."""
+from ihbench.commands.scene_choice import SceneChoice
 
 
 def main(argv: list[str]) -> int:
-    chosen = options(PlanOptions, argv, "plan", "What a run would do, what is left out and why. Runs nothing.")
+    chosen = options(SceneChoice, argv, "plan", "What a run would do, what is left out and why. Runs nothing.")
     from ihbench.data_source import locate, open_capture
     from ihbench.plan import absent_regions, expected_seconds, measure_scene
     from ihbench.protocol import load_protocol

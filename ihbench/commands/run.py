@@ -4,32 +4,18 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field, make_dataclass
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
 from ihbench import registry
 from ihbench.commands.parse import options
+from ihbench.commands.scene_choice import SceneChoice
 from ihbench.errors import BadInput
 
 
 @dataclass(frozen=True)
-class RunOptions:
-    protocol: str
-    """Protocol to run (see `ihbench list protocols`), or the path of a protocol file of your own (.toml)."""
-    method: str = "inpainthuman"
-    """Method to fit; see `ihbench list methods`."""
-    scene: tuple[str, ...] = ()
-    """Scenes; none means all that the protocol names."""
-    profile: str = "quick"
-    """quick (256 px, for a CPU) or paper (512 px, the paper's settings)."""
-    data: Path | None = None
-    """Your copy of the data set; without it (and without IHBENCH_DATA) a stand-in is made."""
-    body: Path | None = None
-    """SMPL model file for real data (or IHBENCH_BODY)."""
-    runs: Path = Path("runs")
-    """Where run folders are written."""
+class RunOptions(SceneChoice):
     seed: tuple[int, ...] = (0,)
     """Seeds; each is a run of its own."""
     device: Literal["cpu", "cuda"] = "cpu"
@@ -40,8 +26,6 @@ class RunOptions:
     """Switches that the plan must not change for this scene; "all" keeps everything."""
     force: bool = False
     """Run again even if the same run is done."""
-    json: bool = False
-    """Print one JSON object on stdout and nothing else there."""
 
 
 def main(argv: list[str]) -> int:

@@ -43,7 +43,7 @@ from ihbench.render.splat import ALPHA_MAX, ALPHA_MIN, Splats
 
 TILE = 16  # px
 CHUNK = 32  # splats between two stored transmittances
-T_STOP = 1e-2  # a transmittance below it counts as none
+T_STOP = 1e-5  # a transmittance below it counts as none
 PARTS = 32  # the tiles are dealt into as many hands, and the threads take one hand after the other
 SHARES = 8  # parts of the splats that are binned side by side; fixed, so that the threads cannot change the lists
 CHANNELS = 3  # colour channels of one pass; other counts are drawn in several

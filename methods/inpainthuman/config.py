@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from ihbench.errors import BadInput
 from ihbench.plan import Omission, SceneMeasure
 
 STATIC_DEG = 5.0  # below this joint motion nothing depends on the pose
@@ -77,6 +78,26 @@ class InpaintHumanConfig:
     """Leave out Gaussians that the posed body hides before they are decoded. Changes time, hardly the image."""
     paper_strict: bool = False
     """Follow the paper's text where it differs from sensible defaults: no background term, no regularisers."""
+
+    def __post_init__(self) -> None:
+        rules = (
+            ("texels", 8 <= self.texels <= 4096, "8 to 4096"),
+            ("levels", bool(self.levels) and all(4 <= r <= 4096 for r in self.levels), "one or more of 4 to 4096"),
+            ("channels", self.channels >= 1, "1 or more"),
+            ("decoder_layers", self.decoder_layers >= 1, "1 or more"),
+            ("decoder_width", self.decoder_width >= 1, "1 or more"),
+            ("encoding_frequencies", self.encoding_frequencies >= 0, "0 or more"),
+            ("position_map", self.position_map >= 16 and self.position_map % 8 == 0, "a multiple of 8, 16 or more"),
+            ("residual_channels", self.residual_channels >= 4 and self.residual_channels % 4 == 0, "a multiple of 4"),
+            ("scale_initial", self.scale_initial > 0, "above 0"),
+            ("scale_limit", self.scale_limit > 0, "above 0 m"),
+            ("steps", self.steps >= 1, "1 or more"),
+            ("clip_gradient", self.clip_gradient > 0, "above 0"),
+        )
+        for name, holds, expected in rules:
+            if not holds:
+                flag = name.replace("_", "-")
+                raise BadInput(f"--method.{flag} {getattr(self, name)}: expected {expected}")
 
 
 QUICK = InpaintHumanConfig()
