@@ -34,6 +34,11 @@ def own_data(data: Path | None) -> Path | None:
     return named
 
 
+def own_body(body: Path | None) -> Path | None:
+    """The user's SMPL file: `--body`, else `IHBENCH_BODY`, else None."""
+    return body or (Path(os.environ["IHBENCH_BODY"]) if os.environ.get("IHBENCH_BODY") else None)
+
+
 @dataclass(frozen=True)
 class DataSource:
     """The captures a protocol runs on."""
@@ -77,10 +82,15 @@ def locate(protocol: Protocol, data: Path | None, scenes: tuple[str, ...]) -> Da
             f"protocol {protocol.name}: data set {protocol.dataset!r} has no stand-in; give your copy with --data"
         )
     known = list(protocol.standin_subjects)
-    # a new generator or body makes other people: they get a folder of their own instead of a refusal
-    made_by = f"v{registry.load('stand-in', protocol.dataset).version}-{load_body().content_sha()[:6]}"
-    root = cache_folder() / "standin" / f"{protocol.dataset}-{made_by}-seed{STANDIN_SEED}"
+    root = standin_root(protocol.dataset)
     return DataSource(protocol, root, True, _chosen(scenes, known, known, "of the stand-in (no --data given)"))
+
+
+def standin_root(dataset: str) -> Path:
+    """Where the stand-in of a data set lies, or will lie."""
+    # a new generator or body makes other people: they get a folder of their own instead of a refusal
+    made_by = f"v{registry.load('stand-in', dataset).version}-{load_body().content_sha()[:6]}"
+    return cache_folder() / "standin" / f"{dataset}-{made_by}-seed{STANDIN_SEED}"
 
 
 def open_capture(dataset: str, root: Path, scene: str, body: Path | None) -> tuple[Capture, Body]:
@@ -93,7 +103,7 @@ def open_capture(dataset: str, root: Path, scene: str, body: Path | None) -> tup
     capture = source.open(scene)
     if capture.body == "procedural":
         return capture, load_body()
-    named = body or (Path(os.environ["IHBENCH_BODY"]) if os.environ.get("IHBENCH_BODY") else None)
+    named = own_body(body)
     if named is None:
         raise BadInput(
             f"{dataset} {scene}: its poses need the SMPL model file (SMPL_NEUTRAL.pkl, from smpl.is.tue.mpg.de); "

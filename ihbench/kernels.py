@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import ctypes
 import json
-import os
-import platform
 import re
 import time
 from collections.abc import Callable, Sequence
@@ -20,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ihbench import machine
 from ihbench.camera import Camera, look_at
 from ihbench.errors import BadInput
 
@@ -31,6 +30,7 @@ REPEATS = 15
 UNSTABLE = 0.25  # a spread above this share of the median is marked
 SPLAT_CASES = (("5k@128", 5_000, 128), ("20k@256", 20_000, 256), ("50k@512", 50_000, 512), ("200k@512", 200_000, 512))
 NO_GRADIENT = 1e-12  # a scene of clamped alphas has gradients of 1e-30; they mean 0
+TABLE_WIDTH = 100  # characters; a narrower terminal would cut the numbers
 WINDOW = 64  # px; side of the window in which the float64 twin is drawn
 
 
@@ -49,11 +49,11 @@ def run_kernels(names: Sequence[str] | None = None, as_json: bool = False, repea
     if repeats < 1:
         raise BadInput(f"kernel repetitions: expected at least 1, got {repeats}")
     rows = [row for name in (names or KERNELS) for row in KERNELS[name](repeats)]
-    machine = describe_machine()
+    about = machine.identity()
     if as_json:
-        print(json.dumps({"machine": machine, "rows": rows}))
+        print(json.dumps({"machine": about, "rows": rows}))
     else:
-        _print_table(machine, rows)
+        _print_table(about, rows)
     return rows
 
 
@@ -353,28 +353,14 @@ def _status_kib(field: str) -> int:
     return int(match.group(1))
 
 
-def describe_machine() -> Row:
-    """Processor, threads and load: what the milliseconds hold for."""
-    import torch
-
-    model = platform.processor() or platform.machine()
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        match = re.search(r"^model name\s*:\s*(.+)$", cpuinfo.read_text(), re.MULTILINE)
-        model = match.group(1) if match else model
-    return {
-        "cpu": model,
-        "threads": torch.get_num_threads(),
-        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
-        "load": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
-    }
-
-
-def _print_table(machine: Row, rows: list[Row]) -> None:
+def _print_table(about: Row, rows: list[Row]) -> None:
+    from rich.box import SIMPLE
     from rich.console import Console
     from rich.table import Table
 
-    table = Table("kernel", "case", "back end", "fwd ms", "bwd ms", "MiB", "error", "grad err", "", pad_edge=False)
+    table = Table(
+        "kernel", "case", "back end", "fwd ms", "bwd ms", "MiB", "error", "grad err", "", pad_edge=False, box=SIMPLE
+    )
     for row in rows:
         times = (
             "–" if row[f"{k}_ms"] is None else f"{row[f'{k}_ms']:.1f}±{row[f'{k}_iqr_ms'] / 2:.1f}"
@@ -384,10 +370,10 @@ def _print_table(machine: Row, rows: list[Row]) -> None:
         errors = ("–" if row[k] is None else f"{row[k]:.0e}" for k in ("value_error", "gradient_error"))
         note = "unstable" if row["unstable"] else ""
         table.add_row(row["kernel"], row["case"], row["backend"], *times, memory, *errors, note)
-    console = Console()
+    console = Console(width=max(Console().width, TABLE_WIDTH))
     console.print(table)
-    gpu = f", {machine['gpu']}" if machine["gpu"] else ""
-    console.print(f"{machine['cpu']}, {machine['threads']} threads{gpu}, load {machine['load']}")
+    gpu = f", {about['gpu']}" if about["gpu"] else ""
+    console.print(f"{about['cpu']}, {about['torch_threads']} threads{gpu}, load average {about['load_average']}")
     console.print(
         f"Median ± half the interquartile range; unstable: the range exceeds {UNSTABLE:.0%} of the median. Errors are"
         f" against the float64 twin in a window of {WINDOW}² px (image: largest; gradient: relative norm); those of"

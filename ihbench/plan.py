@@ -83,23 +83,22 @@ def measure_scene(capture: Capture, protocol: Protocol, body: Body) -> SceneMeas
     texels = texel_table(body, TEXELS)
     seen = texel_visibility(views, body, texels)
     poses = np.stack([capture.body_pose(frame).pose for frame in frames])
-    first = views[0]
-    vertices = body.pose(first.body_pose)
-    depth = float(first.camera.to_camera(vertices)[:, 2].mean())
-    focal = float(np.sqrt(first.camera.K[0, 0] * first.camera.K[1, 1])) * protocol.image.size / first.camera.width
-    corners = vertices[body.faces]
+    camera = views[0].camera
+    depth = float(np.median([camera.to_camera(body.posed_joints(view.body_pose))[:, 2].mean() for view in views]))
+    focal = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1])) * protocol.image.size / camera.width
+    corners = body.pose(views[0].body_pose)[body.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
     filled = len(texels.face) / TEXELS**2
     return SceneMeasure(
         training_views=len(frames),
-        covered_views=sum(covered),
+        covered_views=sum(covered) if occlusion.columns.any() else 0,
         test_views=len(protocol.testing_cameras(len(capture.camera_ids)))
         * len(protocol.testing_frames(capture.name, capture.n_frames)),
         hidden_share=hidden / person if person else 0.0,
         visible_texels=_share(seen, "visible"),
         hidden_texels=_share(seen, "hidden"),
         never_seen_texels=_share(seen, "never_seen"),
-        motion_deg=float(np.rad2deg(np.ptp(poses[:, 1:], axis=0).max())),
+        motion_deg=_motion(poses[:, 1:]),
         turn_deg=_turn(poses[:, 0]),
         pixel_mm=1000 * depth / focal,
         surface_mm=1000 * float(np.sqrt(area / filled)),
@@ -132,14 +131,20 @@ def _mask_view(capture: Capture, protocol: Protocol, occlusion: Occlusion, frame
     return _MaskView(state, camera.scaled(state.shape[1], state.shape[0]), capture.body_pose(frame))
 
 
+def _motion(rotations: NDArray[np.float64]) -> float:  # [F, J, 3] rad
+    """Degrees of the largest rotation of any joint between any two frames, however its axis-angles are written."""
+    half = np.linalg.norm(rotations, axis=-1, keepdims=True) / 2
+    quaternions = np.concatenate([np.cos(half), np.sinc(half / np.pi) * rotations / 2], -1)
+    cosine = min(np.abs(q @ q.T).min() for q in quaternions.transpose(1, 0, 2))
+    return float(np.rad2deg(2 * np.arccos(min(cosine, 1.0))))
+
+
 def _turn(roots: NDArray[np.float64]) -> float:  # [F, 3] rad
-    """Degrees between the extreme headings of the body's front, unwrapped over the frames."""
-    front = axis_angle_to_matrix(roots)[:, :, 2]
-    # the two world axes in which the front moves most span the ground plane, whichever axis is up
-    _, _, axes = np.linalg.svd(front - front.mean(0), full_matrices=False)
-    plane = front @ axes[:2].T
-    centred = np.unwrap(np.arctan2(plane[:, 1], plane[:, 0]))
-    return float(np.rad2deg(np.ptp(centred)))
+    """Degrees between the extreme headings of the body's front about its mean upright, unwrapped over the frames."""
+    axes = axis_angle_to_matrix(roots)
+    _, _, basis = np.linalg.svd(axes[:, :, 1].mean(0)[None])  # the upright, then two axes across it
+    across = axes[:, :, 2] @ basis[1:].T
+    return float(np.rad2deg(np.ptp(np.unwrap(np.arctan2(across[:, 1], across[:, 0])))))
 
 
 def expected_seconds(runs: Path, method: str, profile: str) -> float | None:

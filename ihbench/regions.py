@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.camera import Camera
-from ihbench.render.zbuffer import rasterize
+from ihbench.render.zbuffer import NEAR, rasterize
 from ihbench.scene import TestView
 from ihbench.visibility import Visibility
 
@@ -84,7 +84,7 @@ def projected_box(vertices: NDArray[np.float64], camera: Camera, padding: float)
     low, high = vertices.min(0) - padding, vertices.max(0) + padding
     corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
     p = camera.project(corners)
-    if (p[:, 2] <= 0).any():  # the box reaches behind the camera: its outline has no bounded projection
+    if not (p[:, 2] >= NEAR).all():  # the box reaches the camera plane: its outline has no bounded projection
         return np.ones((camera.height, camera.width), bool)
     hull = cv2.convexHull(np.round(p[:, :2] - 0.5).astype(np.int32))
     mask = np.zeros((camera.height, camera.width), np.uint8)

@@ -12,6 +12,9 @@ from ihbench import atomic
 from ihbench.errors import BadInput
 from ihbench.metrics import Mean, Score, mean_over_frames
 from ihbench.scoring import ViewScores
+from ihbench.store import RunFolder
+
+NAMED_BY = {"protocol", "protocol_digest", "profile", "scene", "method", "seed", "code"}  # of the identity
 
 
 @dataclass(frozen=True)
@@ -75,16 +78,19 @@ def mean_rows(lines: Iterable[dict[str, Any]]) -> dict[str, dict[str, Mean]]:
 
 def read_result(folder: Path) -> RunResult:
     """Read a run folder. Raises `BadInput` when it is none or is damaged."""
-    record = atomic.read_json(folder / "run.json")
-    if not isinstance(record, dict) or not {"identity", "status", "about"} <= record.keys():
+    record = RunFolder.open(folder).record
+    if not record["identity"].keys() >= NAMED_BY or "standin" not in record["about"]:
         raise BadInput(f"{folder}: run.json is not a run record of this bench")
     lines: list[dict[str, Any]] = []
     for name in ("scores.jsonl", "calibration.jsonl"):
         if (folder / name).is_file():
             lines += atomic.read_json_lines(folder / name)
     try:
-        return RunResult(folder, record, mean_rows(lines))
+        rows = mean_rows(lines)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise BadInput(
             f"{folder}: its score files are damaged ({error}); run the same command with --force"
         ) from error
+    if record["status"] == "done" and record["identity"]["method"] not in rows:
+        raise BadInput(f"{folder}: is done, but its scores are gone; run the same command with --force")
+    return RunResult(folder, record, rows)

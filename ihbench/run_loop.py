@@ -20,7 +20,7 @@ from ihbench import __version__, atomic, machine, registry
 from ihbench.body import load_body
 from ihbench.calibration import ROWS, Calibration
 from ihbench.contact_sheet import SheetRow, contact_sheet, write_png
-from ihbench.data_source import DataSource, locate, open_capture
+from ihbench.data_source import DataSource, locate, open_capture, own_body, own_data, standin_root
 from ihbench.errors import BadInput, Diverged
 from ihbench.ledger import Ledger
 from ihbench.metrics import mean_over_frames
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
 CURVE_VIEWS = 6  # test views on which the quality-time curve is measured
 SHEET_VIEWS = 5  # test views on the contact sheet
+TRACEBACK = "traceback.txt"  # of a run that failed, in its folder
 
 
 @dataclass(frozen=True)
@@ -148,20 +149,25 @@ def load_avatar(folder: Path, data: Path | None, body: Path | None) -> tuple[Any
     about, identity = record["about"], record["identity"]
     if not (folder / "avatar").is_dir():
         raise BadInput(f"{folder}: has no avatar (status {record['status']}); finish the run first")
-    protocol = load_protocol(identity["protocol"].partition("@")[0], identity["profile"])
-    if about["standin"]:
-        model = load_body()
-    elif body is not None:
-        model = load_body(body)
-    else:
-        raise BadInput(f"{folder}: was fitted on real data; name the SMPL model file with --body")
+    if not about["standin"] and own_body(body) is None:
+        raise BadInput(f"{folder}: was fitted on real data; name the SMPL model file with --body or IHBENCH_BODY")
+    model = load_body(None if about["standin"] else own_body(body))
     method: Method = registry.load("method", identity["method"])(
         configuration(identity["method"], identity["profile"], {})
     )
 
     def capture() -> Capture:
-        source = locate(protocol, data, (identity["scene"],))
-        return open_capture(protocol.dataset, source.root, identity["scene"], body)[0]
+        root = own_data(data)
+        if root is None and not about["standin"]:
+            raise BadInput(f"{folder}: was fitted on real data; name the folder of your copy with --data")
+        root = root or standin_root(identity["dataset"])
+        found = open_capture(identity["dataset"], root, identity["scene"], body)[0]
+        if found.standin != about["standin"]:
+            raise BadInput(
+                f"{root}: holds {found.standin or 'real data'}, the run was fitted on "
+                f"{about['standin'] or 'real data'}; name its data with --data"
+            )
+        return found
 
     return method.load(folder / "avatar", model), capture
 
@@ -175,6 +181,7 @@ class _Run:
         self.ledger = Ledger(folder.path, device=request.device, state=before, on_checkpoint=self._curve_point)
         if before is not None:
             folder.restarted()
+            (folder.path / TRACEBACK).unlink(missing_ok=True)
         self.scorer: Scorer | None = None
 
     def guarded(self) -> None:
@@ -192,8 +199,8 @@ class _Run:
             raise
         except Exception as outcome:
             reason = f"{type(outcome).__name__}: {str(outcome).splitlines()[0] if str(outcome) else 'no message'}"
-            atomic.write_text(self.folder.path / "traceback.txt", traceback.format_exc())
-            self._end("failed", f"{reason} (see traceback.txt)")
+            atomic.write_text(self.folder.path / TRACEBACK, traceback.format_exc())
+            self._end("failed", f"{reason} (see {TRACEBACK})")
 
     def _end(self, status: str, reason: str) -> None:
         self._describe()
@@ -272,7 +279,7 @@ class _Run:
             def after_each(loaded: LoadedView, images: dict[str, NDArray[np.float32]]) -> None:
                 image = images[name]
                 path = self.folder.renders / loaded.key.camera_id / f"{loaded.key.frame:06d}.png"
-                write_png(path, np.round(image * 255).astype(np.uint8))
+                write_png(path, np.round(np.clip(np.nan_to_num(image), 0, 1) * 255).astype(np.uint8))
                 if loaded.index in on_sheet:
                     sheet.append(_sheet_row(scene, loaded, image))
                 task.advance()

@@ -28,9 +28,9 @@ def _group(key: tuple[str, str, str, str], runs: list[RunResult]) -> str:
     kind = f"**{standin}**: made by the bench, not real data" if standin else "real data"
     head = [f"## {protocol}, {profile} profile", "", f"Data: {kind}. Protocol digest `{digest}`."]
     head += [
-        f"Not done: {run.method} on {run.scene}: {run.status} ({run.record['reason']})."
+        f"Not done: {_plain(f'{run.method} on {run.scene}')}: {run.status} ({_plain(run.record['reason'])})."
         for run in runs
-        if run not in done
+        if run.status != "done"
     ]
     if not done:
         return "\n".join(head)
@@ -59,7 +59,7 @@ def _table(runs: list[RunResult], identities: list[Identity], headline: str) -> 
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * 3 + "---:|" * (len(head) - 3)]
     by_label: dict[str, list[RunResult]] = {}
     for run in runs:
-        by_label.setdefault(_label(run), []).append(run)
+        by_label.setdefault(_label(run, runs), []).append(run)
     for label, group in by_label.items():
         cells = [
             label,
@@ -77,9 +77,17 @@ def _table(runs: list[RunResult], identities: list[Identity], headline: str) -> 
     return lines
 
 
-def _label(run: RunResult) -> str:
+def _label(run: RunResult, runs: list[RunResult]) -> str:
+    """The method with what sets this row apart. Runs of several versions of its code are several rows."""
     changed = run.record["about"]["changed"]
-    return run.method + (f" ({', '.join(changed)})" if changed else "")
+    if len({other.identity["code"] for other in runs if other.method == run.method}) > 1:
+        changed = [*changed, f"code {run.identity['code']}"]
+    return _plain(run.method + (f" ({', '.join(changed)})" if changed else ""))
+
+
+def _plain(text: str) -> str:
+    """Text that neither ends a table's cell or line nor is taken for HTML."""
+    return " ".join(text.split()).replace("|", "\\|").replace("<", "&lt;")
 
 
 def _cell(per_run: list[tuple[str, dict[str, Mean]]], identity: Identity) -> str:
@@ -106,14 +114,17 @@ def _largest(runs: list[RunResult], key: str) -> str:
 
 
 def _scenes(runs: list[RunResult]) -> str:
-    return ", ".join(sorted({run.scene for run in runs}))
+    return ", ".join(sorted({_plain(run.scene) for run in runs}))
 
 
 def _left_out(run: RunResult) -> list[str]:
-    """Why cells of the method's row are empty, and what the plan left out."""
+    """Why cells of the method's row are empty, what their means do not run over, and what the plan left out."""
     notes = []
-    for identity, mean in run.rows.get(run.method, {}).items():
+    for identity, mean in run.rows[run.method].items():
+        region = Identity.parse(identity).region
         if mean.absent:
-            notes.append(f"- absent: {Identity.parse(identity).region}: {mean.reason}")
+            notes.append(f"- absent: {region}: {mean.reason}")
+        elif mean.note:
+            notes.append(f"- {region} of {_plain(run.scene)}: {mean.note}")
     notes += [f"- left out: {o['field']} → {o['value']}: {o['reason']}" for o in run.record["about"]["left_out"]]
     return notes

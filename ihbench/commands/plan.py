@@ -8,6 +8,7 @@ from dataclasses import asdict
 from ihbench import registry
 from ihbench.commands.parse import options
 from ihbench.commands.scene_choice import SceneChoice
+from ihbench.errors import BadInput
 
 
 def main(argv: list[str]) -> int:
@@ -15,11 +16,11 @@ def main(argv: list[str]) -> int:
     from ihbench.data_source import locate, open_capture
     from ihbench.plan import absent_regions, expected_seconds, measure_scene
     from ihbench.protocol import load_protocol
+    from ihbench.run_loop import configuration
 
     protocol = load_protocol(chosen.protocol, chosen.profile)
-    registry.entry_point("method", chosen.method)
-    configs = registry.load("config", chosen.method)
-    config = configs.PROFILES[chosen.profile]
+    config = configuration(chosen.method, chosen.profile, {})
+    leave_out = registry.load("config", chosen.method).leave_out
     source = locate(protocol, chosen.data, chosen.scene)
     expected = expected_seconds(chosen.runs, chosen.method, chosen.profile)
     report = {
@@ -36,8 +37,14 @@ def main(argv: list[str]) -> int:
             report["scenes"][scene] = {"note": "stand-in not made yet: the run makes it; measured then"}
             continue
         capture, body = open_capture(protocol.dataset, source.root, scene, chosen.body)
-        measure = measure_scene(capture, protocol, body)
-        omissions = configs.leave_out(config, measure) + absent_regions(measure, protocol.regions)
+        try:
+            measure = measure_scene(capture, protocol, body)
+        except BadInput as error:
+            if not source.is_standin:
+                raise
+            report["scenes"][scene] = {"note": f"the run makes the rest of this stand-in; measured then: {error}"}
+            continue
+        omissions = leave_out(config, measure) + absent_regions(measure, protocol.regions)
         report["scenes"][scene] = {"measure": asdict(measure), "left_out": [asdict(o) for o in omissions]}
     if chosen.json:
         print(json.dumps(report, ensure_ascii=False))

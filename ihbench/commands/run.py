@@ -73,6 +73,8 @@ def _run(chosen: Any) -> int:
         protocol = protocol.with_occlusion(chosen.occlusion)
     if chosen.keep and "all" not in chosen.keep:
         _check_keep(chosen.keep, chosen.config)
+    if not chosen.seed or min(chosen.seed) < 0:
+        raise BadInput(f"--seed {' '.join(map(str, chosen.seed))}: expected one number or more, each 0 or above")
     source = locate(protocol, chosen.data, chosen.scene)
     progress = Progress()
     request = RunRequest(
@@ -80,7 +82,7 @@ def _run(chosen: Any) -> int:
     )
     results = []
     for scene in source.scenes:
-        for seed in chosen.seed:
+        for seed in dict.fromkeys(chosen.seed):
             progress.say(f"{protocol.name} {scene}: {chosen.method}, {chosen.profile} profile, seed {seed}")
             results.append(run_scene(replace(request, seed=seed), source, scene, progress))
     text = registry.load("report", "md")(results)

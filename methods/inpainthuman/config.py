@@ -64,9 +64,9 @@ class InpaintHumanConfig:
     """Weight of the mean squared feature: texels nobody saw fade to zero, so that the coarse level speaks there."""
     steps: int = 600
     """Optimisation steps, one training view each."""
-    lr_maps: float = 5e-3
+    lr_maps: float = 1e-2
     """AdamW step size of the UV feature maps (1e-4 in the paper)."""
-    lr_decoder: float = 2e-3
+    lr_decoder: float = 5e-3
     """AdamW step size of the decoder (1e-4 in the paper)."""
     lr_encoder: float = 5e-4
     """AdamW step size of the residual encoder (1e-4 in the paper)."""
@@ -123,7 +123,8 @@ def leave_out(config: InpaintHumanConfig, scene: SceneMeasure) -> list[Omission]
         reason = f"no joint turns more than {scene.motion_deg:.1f}° over the training frames (limit {STATIC_DEG}°)"
         found.append(Omission("pose_residual", False, reason))
     useful = tuple(r for r in config.levels if scene.texel_mm(r) * FINEST_LEVEL >= scene.pixel_mm)
-    if useful and useful != config.levels:
+    useful = useful or (min(config.levels),)
+    if useful != config.levels:
         reason = (
             f"a pixel covers {scene.pixel_mm:.1f} mm of the body; levels {config.levels} go down to "
             f"{scene.texel_mm(max(config.levels)):.1f} mm"

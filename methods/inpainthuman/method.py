@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ihbench.body import Body
+from ihbench.errors import BadInput
 from ihbench.ledger import Ledger
 from ihbench.methods.inpainthuman.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.config import InpaintHumanConfig
@@ -24,7 +25,9 @@ class InpaintHuman:
     def fit(
         self, training: TrainingSet, *, device: str, seed: int, ledger: Ledger, progress: Progress
     ) -> GaussianAvatar:
-        """Fit one person. See `ihbench.scene.Method`."""
+        """Fit one person. See `ihbench.scene.Method`. Raises `BadInput` without a view that shows the person."""
+        if not len(training.views):
+            raise BadInput(f"scene {training.name}: no training view; nothing to fit")
         with ledger.stage("fit/prepare"):
             betas = np.mean([view.body_pose.betas for view in training.views], axis=0)
             avatar = GaussianAvatar(self.config, training.body, betas, seed).to(device)

@@ -16,9 +16,11 @@ from ihbench.methods.inpainthuman.avatar import GaussianAvatar
 from ihbench.progress import Progress
 from ihbench.render.splat import render_gaussians
 from ihbench.scene import MaskState, TrainingSet, TrainView
+from ihbench.views import LazyViews
 
 MARGIN = 0.15  # of the projected body's box on every side: garments and pose errors stay inside the window
 STATE = "stage1"
+TARGETS_HELD = 256  # prepared views kept in memory, about 2 MB each in the paper profile
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,8 @@ class Stage1:
         self.optimizer = torch.optim.AdamW(groups, fused=True)
         self.names = {id(p): name for name, p in avatar.named_parameters()}
         self.step = 0
-        self._targets: dict[int, Target] = {}
+        views = training.views
+        self._targets = LazyViews(lambda k: prepare_target(avatar, views[k]), len(views), held=TARGETS_HELD)
 
     def run(self, progress: Progress) -> None:
         """Optimise to the last step, resuming a saved state if the ledger has one.
@@ -147,11 +150,6 @@ class Stage1:
         epoch, k = divmod(step, n)
         return int(np.random.default_rng((self.seed, epoch)).permutation(n)[k])
 
-    def _target(self, k: int) -> Target:
-        if k not in self._targets:
-            self._targets[k] = prepare_target(self.avatar, self.training.views[k])
-        return self._targets[k]
-
     def _one_step(self, k: int) -> None:
         config = self.avatar.config
         share = self.step / config.steps
@@ -160,7 +158,7 @@ class Stage1:
         for group, rate in zip(self.optimizer.param_groups, self.rates, strict=True):
             group["lr"] = rate * decay
         self.optimizer.zero_grad(set_to_none=True)
-        loss = loss_of(self.avatar, self._target(k), self.training.background)
+        loss = loss_of(self.avatar, self._targets[k], self.training.background)
         if not math.isfinite(loss.item()):
             raise Diverged(self.step, f"loss is {loss.item()}")
         loss.backward()

@@ -1,5 +1,6 @@
 """The numba renderer against the float64 twin: images to 1e-3, gradients to 1e-3, on everyday and extreme scenes."""
 
+import math
 import multiprocessing
 
 import numpy as np
@@ -113,6 +114,20 @@ def test_huge_splats_do_not_fill_the_memory(monkeypatch):
     assert (alpha > 0.998).all()
     front = int(s.means[:, 2].argmin())
     assert torch.allclose(rgb[128, 128], s.colors[front], atol=2e-3)
+
+
+def test_dropped_alphas_hide_nothing():
+    """Thousands of wide splats whose alpha in a corner is under the threshold: what is behind shows there."""
+    n = 30_000
+    xy = torch.tensor([[-31.7, -31.7]], dtype=torch.float64).repeat(n + 1, 1)
+    variance = torch.full((n + 1,), 20.0**2, dtype=torch.float64)
+    xy[n], variance[n] = torch.tensor([15.5, 15.5], dtype=torch.float64), 1.0
+    farthest = math.exp(-float((xy[n] - xy[0]).square().sum()) / (2 * 20.0**2))
+    assert 0.0037 < farthest < 1 / 255
+    colors = torch.zeros(n + 1, 3)
+    colors[n, 1] = 1.0
+    rgb, _ = splat_numba.composite(Splats(xy, variance, torch.linspace(1, 2, n + 1), colors), 16, 16, torch.zeros(3))
+    assert rgb[15, 15].tolist() == pytest.approx([0, 0.999, 0], abs=1e-6)
 
 
 def test_no_grad_stores_no_transmittances(monkeypatch):

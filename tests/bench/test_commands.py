@@ -1,0 +1,250 @@
+"""The commands beside `run`: plan, report, export, data, and what they say about a finished run."""
+
+import json
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from ihbench import registry
+from ihbench.atomic import read_json, read_json_lines
+from ihbench.body.canonical import canonical_pose
+from ihbench.data_source import standin_root
+from ihbench.results import read_result
+from ihbench.run_loop import load_avatar
+from ihbench.scene import BodyPose
+from ihbench.splat_ply import read_splat_ply
+from tests.conftest import contents, tiny_protocol
+
+BODY_PSNR = "psnr/pooled/range1/body/v1"
+
+
+def table_row(text, label):
+    """The cells of a Markdown table's row, by column head."""
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
+    (found,) = [row for row in rows if row[0].startswith(label)]
+    return dict(zip(rows[0], found, strict=True))
+
+
+# ------------------------------------------------------------------------------------------------------- plan
+
+
+def test_plan_says_what_a_run_would_measure_and_leave_out(bench_with_run, finished):
+    words = ["plan", "--protocol", bench_with_run.protocol, "--runs", bench_with_run.runs]
+    plain = bench_with_run(*words, "--scene", "standin-1")
+    told = json.loads(bench_with_run(*words, "--scene", "standin-1", "--json").out)
+    about = read_json(finished.folder / "run.json")["about"]
+    assert told["scenes"]["standin-1"]["measure"] == about["measure"]
+    assert told["expected_seconds_per_scene"] == about["total_seconds"]
+    assert "5 training views (4 occluded), 4 test views" in plain.out
+    (omission,) = told["scenes"]["standin-1"]["left_out"]
+    assert omission["field"] == "levels"
+    assert f"left out: levels -> ({omission['value'][0]},): {omission['reason']}" in plain.out
+    assert (plain.status, plain.err) == (0, "")
+    assert contents(bench_with_run.runs / finished.folder.name) == contents(finished.folder)
+
+
+def test_plan_imports_neither_torch_nor_cv2(bench):
+    words = ["plan", "--protocol", str(bench.protocol), "--scene", "standin-1"]
+    code = (
+        "import sys\nfrom ihbench.cli import main\n"
+        f"status = main({words!r})\nprint(status, sorted({{'torch', 'cv2'}} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], env=bench.environment, capture_output=True, text=True)
+    assert "left out: levels" in done.stdout
+    assert done.stdout.splitlines()[-1] == "0 []", done.stderr
+
+
+def test_plan_says_which_stand_ins_are_not_made_yet(bench, tmp_path):
+    scenes = json.loads(bench("plan", "--protocol", bench.protocol, "--json").out)["scenes"]
+    assert [name for name, found in scenes.items() if "measure" in found] == ["standin-1", "standin-2"]
+    assert all("the run makes it" in scenes[f"standin-{k}"]["note"] for k in (3, 4, 5, 6))
+
+    other = tiny_protocol(tmp_path / "other.toml", ("train = { frames = { step = 100 } }", ""))
+    outcome = bench("plan", "--protocol", other, "--scene", "standin-1")
+    assert outcome.status == 0
+    assert "the run makes the rest of this stand-in" in outcome.out
+
+
+# ------------------------------------------------------------------------------------------------------ report
+
+
+def test_two_scenes_share_a_row_whose_number_is_the_mean_of_the_scenes_means(bench, mannequin):
+    for scene in ("standin-1", "standin-2"):
+        assert bench.run(scene=scene, method=mannequin).status == 0
+    of_views = [
+        np.mean([row["scores"][BODY_PSNR] for row in read_json_lines(folder / "scores.jsonl")])
+        for folder in bench.folders()
+    ]
+    assert abs(of_views[0] - of_views[1]) > 0.02
+    outcome = bench("report", "--runs", bench.runs)
+    assert outcome.status == 0
+    assert outcome.out.count("\n## ") + outcome.out.startswith("## ") == 1
+    cells = table_row(outcome.out, "mannequin")
+    assert cells["scenes"] == "2"
+    assert cells["PSNR↑ **body**"] == f"{np.mean(of_views):.2f}"
+    assert table_row(outcome.out, "*truth*")["scenes"] == "2"
+
+
+def test_runs_under_other_occlusion_stand_in_another_table(bench, mannequin):
+    for more in ((), ("--occlusion", "none")):
+        assert bench.run(*more, method=mannequin).status == 0
+    text = bench("report", "--runs", bench.runs).out
+    first, second = text.split("\n\n## ")
+    assert {first.splitlines()[0], "## " + second.splitlines()[0]} == {
+        "## zju_occ@1, quick profile",
+        "## zju_occ@1+occlusion=none, quick profile",
+    }
+    assert all(part.count("| mannequin |") == 1 for part in (first, second))
+
+
+def test_a_report_can_name_its_runs_and_its_file(bench_with_run, mannequin, tmp_path):
+    assert bench_with_run.run(method=mannequin).status == 0
+    chosen = next(folder for folder in bench_with_run.folders() if "mannequin" in folder.name)
+    outcome = bench_with_run("report", chosen, "--out", tmp_path / "table.md")
+    assert (outcome.status, outcome.out) == (0, "")
+    text = (tmp_path / "table.md").read_text(encoding="utf-8")
+    assert "| mannequin |" in text
+    assert "| inpainthuman" not in text
+
+
+def test_a_damaged_run_does_not_take_the_others_with_it(bench_with_run, finished):
+    damaged = bench_with_run.runs / "damaged"
+    for name, spoil in {
+        "cut": lambda folder: (folder / "run.json").write_text('{"schema_version": 1, "sta'),
+        "foreign": lambda folder: (folder / "run.json").write_text('{"schema_version": 1}'),
+        "lost": lambda folder: (folder / "scores.jsonl").unlink(),
+    }.items():
+        folder = damaged.with_name(name)
+        shutil.copytree(finished.folder, folder)
+        spoil(folder)
+    outcome = bench_with_run("report", "--runs", bench_with_run.runs)
+    assert outcome.status == 0
+    assert outcome.out.count("| inpainthuman") == 1
+    assert table_row(outcome.out, "inpainthuman")["scenes"] == "1"
+    lines = outcome.err.splitlines()
+    assert [line.startswith("ihbench: left out: ") for line in lines] == [True] * 3
+    assert all(any(f"/{name}" in line for line in lines) for name in ("cut", "foreign", "lost"))
+
+
+# ------------------------------------------------------------------------------------------------------ export
+
+
+@pytest.mark.parametrize("pose", ["a_pose", "120"])
+def test_export_writes_the_avatars_gaussians_in_the_pose_asked_for(bench_with_run, tmp_path, pose):
+    (folder,) = bench_with_run.folders()
+    out = tmp_path / "avatar.ply"
+    outcome = bench_with_run("export", folder, "--to", "ply", "--pose", pose, "--out", out)
+    assert outcome.status == 0, outcome.err
+    means, scales, colors = read_splat_ply(out.read_bytes())
+    with bench_with_run.in_its_world():
+        avatar, open_capture = load_avatar(folder, None, None)
+        body_pose = (
+            open_capture().body_pose(120)
+            if pose == "120"
+            else BodyPose(canonical_pose("a_pose"), avatar.betas, np.zeros(3))
+        )
+        expected = [value.numpy() for value in avatar.gaussians(body_pose)]
+    assert len(means) == len(avatar) > 100
+    np.testing.assert_array_equal(means, expected[0])
+    np.testing.assert_allclose(scales, expected[1], rtol=1e-5)
+    np.testing.assert_allclose(colors, expected[2], atol=1e-6)
+    body = avatar.body.pose(body_pose)
+    np.testing.assert_allclose([means.min(0), means.max(0)], [body.min(0), body.max(0)], atol=0.05)
+
+
+def test_export_lies_in_the_run_folder_unless_told_otherwise(bench_with_run):
+    (folder,) = bench_with_run.folders()
+    outcome = bench_with_run("export", folder)
+    assert str(folder / "avatar.ply") in outcome.out
+    assert len(read_splat_ply((folder / "avatar.ply").read_bytes())[0]) > 100
+
+
+def test_export_in_a_frames_pose_never_takes_another_person(bench_with_run, tmp_path):
+    """standin-1 of another cast has the same name and another body."""
+    (folder,) = bench_with_run.folders()
+    with bench_with_run.in_its_world():
+        registry.load("stand-in", "zju_mocap").ensure(tmp_path / "cast", 1, ["standin-1"], {0: [0]})
+    outcome = bench_with_run("export", folder, "--pose", "0", "--data", tmp_path / "cast")
+    assert outcome.status == 2
+    assert "holds stand-in v1 seed 1, the run was fitted on stand-in v1 seed 0" in outcome.err
+
+
+# -------------------------------------------------------------------------------------------------------- data
+
+
+def test_a_stand_in_written_on_request_passes_the_check_and_runs(bench, tmp_path, mannequin):
+    protocol = tiny_protocol(tmp_path / "two.toml", ("step = 8", "step = 16"), ("step = 100", "step = 250"))
+    words = ["--profile", "quick", "--protocol", protocol]
+    outcome = bench("data", "standin", "--out", tmp_path / "cast", "--seed", 3, *words)
+    assert outcome.status == 0
+    assert outcome.out.splitlines() == [
+        f"standin-1 (seed 3) written to {tmp_path / 'cast'}; run with --data {tmp_path / 'cast'}"
+    ]
+    check = bench("data", "check", tmp_path / "cast", "--json")
+    told = json.loads(check.out)
+    assert (check.status, told["ok"], told["standin"]) == (0, True, "stand-in v1 seed 3")
+    assert "standin: stand-in v1 seed 3" in bench("data", "check", tmp_path / "cast").out
+    run = bench.run(*words, "--data", tmp_path / "cast", method=mannequin)
+    assert run.status == 0
+    assert "**stand-in v1 seed 3**" in run.out
+
+
+def test_data_check_names_what_is_wrong_and_returns_1(bench, tmp_path):
+    with bench.in_its_world():
+        copy = shutil.copytree(standin_root("zju_mocap"), tmp_path / "copy")
+    picture = copy / "CoreView_standin-2" / "Camera_B1" / "000000.jpg"
+    picture.write_bytes(picture.read_bytes()[:3000])
+    before = contents(copy)
+    outcome = bench("data", "check", copy)
+    assert outcome.status == 1
+    assert f"{picture}: damaged or cut short" in outcome.out
+    assert contents(copy) == before
+
+
+def test_data_check_of_a_folder_without_a_known_layout(bench, tmp_path):
+    (tmp_path / "empty").mkdir()
+    outcome = bench("data", "check", tmp_path / "empty")
+    assert (outcome.status, outcome.out) == (2, "")
+    assert "no known layout" in outcome.err
+
+
+# ----------------------------------------------------------------------------------------- list, protocol, help
+
+
+def test_everything_listed_can_be_named_in_a_run(bench, mannequin):
+    told = json.loads(bench("list", "--json").out)
+    assert {"inpainthuman", mannequin} <= set(told["methods"])
+    assert "zju_mocap" in told["datasets"]
+    assert {"zju_occ@1", "zju_occ_occnerf@1"} <= set(told["protocols"])
+    plain = bench("list").out
+    assert all(name in plain for kind in told.values() for name in kind)
+
+
+def test_protocol_show_prints_every_choice_and_diff_only_the_different_ones(bench):
+    shown = json.loads(bench("protocol", "show", bench.protocol, "--profile", "quick", "--json").out)
+    assert shown["image"]["size"] == 64
+    assert shown["digest"]
+    same = bench("protocol", "diff", "zju_occ", "zju_occ")
+    assert (same.status, same.out) == (0, "")
+    told = json.loads(bench("protocol", "diff", "zju_occ", "zju_occ_occnerf", "--json").out)
+    assert all(row["zju_occ"] != row["zju_occ_occnerf"] for row in told)
+    assert "occlusion.covers.of" in {row["key"] for row in told}
+
+
+def test_help_is_no_error_and_no_words_are_help(bench):
+    for words in ([], ["--help"]):
+        outcome = bench(*words)
+        assert outcome.status == 0
+        assert "usage: ihbench COMMAND" in outcome.out
+    with pytest.raises(SystemExit) as end:
+        bench("run", "--help")
+    assert not end.value.code
+
+
+def test_reports_and_runs_show_the_same_numbers(bench_with_run, finished):
+    cells = table_row(bench_with_run("report", "--runs", bench_with_run.runs).out, "inpainthuman")
+    assert cells == table_row(finished.outcome.out, "inpainthuman")
+    assert cells["PSNR↑ **body**"] == f"{read_result(finished.folder).rows['inpainthuman'][BODY_PSNR].value:.2f}"

@@ -1,0 +1,222 @@
+"""What a scene needs: the measures against known scenes, and what follows from them."""
+
+import json
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ihbench import plan
+from ihbench.body import texel_table
+from ihbench.methods.inpainthuman.config import PAPER, QUICK, leave_out
+from ihbench.plan import TEXELS, SceneMeasure, absent_regions, expected_seconds, measure_scene
+from ihbench.protocol import REGIONS
+from ihbench.scene import BodyPose
+from ihbench.views import hidden_fraction, open_scene
+from ihbench.visibility import texel_visibility
+
+from .fake_capture import DISTANCE, DISTORTION, FOCAL, SIZE, FakeCapture, a_camera, a_pose, fake_protocol, the_body
+from .fake_capture import turning_capture as turning
+
+BODY = the_body()
+
+
+def measured(capture, **changes):
+    protocol = replace(fake_protocol(n_frames=capture.n_frames), **changes)
+    return measure_scene(capture, protocol, BODY)
+
+
+def capture_of(roots=None, joint=None):
+    """Frames with these root rotations [F, 3], or with this rotation [F, 3] of the left elbow."""
+    poses = []
+    for vector in roots if roots is not None else joint:
+        pose = a_pose().pose.copy()
+        pose[0 if roots is not None else 18] = vector
+        poses.append(BodyPose(pose, np.zeros(10), np.zeros(3)))
+    return FakeCapture(poses, [a_camera(size=32)] * 4)
+
+
+@pytest.fixture(scope="module")
+def moving():
+    return measured(turning())
+
+
+# ---------------------------------------------------------------------------------------------- measures
+
+
+def test_counts_and_record(moving):
+    assert (moving.training_views, moving.covered_views, moving.test_views) == (10, 8, 3 * 4)
+    assert moving.occlusion["rule"] == "strip-generic"
+    assert moving.occlusion["width"] > 0
+    json.dumps(asdict(moving))
+    assert measured(turning(), occlusion=fake_protocol(rule="none").occlusion).covered_views == 0
+
+
+def test_shares_are_a_partition_of_the_surface(moving):
+    shares = (moving.visible_texels, moving.hidden_texels, moving.never_seen_texels)
+    assert sum(shares) == pytest.approx(1)
+    assert all(0 < share < 1 for share in shares)
+
+
+@pytest.mark.parametrize("distortion", [None, DISTORTION], ids=["pinhole", "distorted"])
+def test_what_is_measured_on_raw_masks_holds_on_the_views_a_method_gets(distortion):
+    capture, protocol = turning(distortion=distortion), fake_protocol(size=SIZE)
+    found = measure_scene(capture, protocol, BODY)
+    scene = open_scene(capture, protocol)
+    seen = texel_visibility(scene.train, BODY, texel_table(BODY, TEXELS))
+    assert found.visible_texels == pytest.approx(seen.visible.mean(), abs=0.04)
+    assert found.hidden_texels == pytest.approx(seen.hidden.mean(), abs=0.04)
+    assert found.never_seen_texels == pytest.approx(seen.never_seen.mean(), abs=0.02)
+    assert found.hidden_share == pytest.approx(hidden_fraction(scene))
+
+
+def test_large_images_are_reduced_without_a_shift():
+    """Three times the size gives the same shares; at 768 px every third pixel is read."""
+    strip = fake_protocol(strip=(128, 20), width=256).occlusion
+    poses = [a_pose(k) for k in range(3)]
+    small, large = (measured(FakeCapture(poses, [a_camera(size=s)] * 2), occlusion=strip) for s in (256, 768))
+    assert large.hidden_share == pytest.approx(small.hidden_share, abs=0.01)
+    for name in ("visible_texels", "hidden_texels", "never_seen_texels"):
+        assert getattr(large, name) == pytest.approx(getattr(small, name), abs=0.01)
+    assert large.pixel_mm == pytest.approx(small.pixel_mm)
+
+
+def test_one_frame_shows_one_side():
+    found = measured(capture_of(np.zeros((1, 3))))
+    assert found.never_seen_texels > 0.5
+    assert (found.training_views, found.motion_deg, found.turn_deg) == (1, 0, 0)
+
+
+def test_a_pixel_and_a_texel_in_millimetres(moving):
+    assert moving.pixel_mm == pytest.approx(1000 * DISTANCE / (FOCAL * 48 / SIZE), rel=0.03)
+    assert measured(turning(), image=fake_protocol(size=SIZE).image).pixel_mm == pytest.approx(moving.pixel_mm / 2)
+    # 1.8 m² of surface: about 2.4 cm at 64² and 0.6 cm at 256² (protocols.md sec. 8, item 11)
+    assert 18 < moving.texel_mm(64) < 28
+    assert moving.texel_mm(256) == pytest.approx(moving.texel_mm(64) / 4)
+
+
+# ------------------------------------------------------------------------------------------ turn and motion
+
+
+@pytest.mark.parametrize("degrees", [0, 90, 360, 540])
+@pytest.mark.parametrize("world", ["y up", "z up", "z down"])
+def test_the_turn_of_a_known_turn(degrees, world):
+    yaw = np.linspace(-0.3, -0.3 + np.deg2rad(degrees), 7)
+    tilt = Rotation.from_euler("x", {"y up": 0, "z up": 90, "z down": -90}[world], degrees=True)
+    roots = (tilt * Rotation.from_euler("y", yaw[:, None])).as_rotvec()
+    assert measured(capture_of(roots), occlusion=fake_protocol(rule="none").occlusion).turn_deg == pytest.approx(
+        degrees, abs=1e-5
+    )
+
+
+def test_who_only_sways_does_not_turn():
+    sway = np.random.default_rng(0).normal(0, 0.01, (12, 3))
+    assert measured(capture_of(sway)).turn_deg < 5
+    assert measured(capture_of(np.array([[0.0, 0, 0], [0, 1, 0]]))).turn_deg == pytest.approx(np.rad2deg(1))
+
+
+@pytest.mark.parametrize("middle", [0.0, 0.5, np.pi])
+def test_motion_is_the_largest_angle_between_two_frames(middle):
+    """Also about π, where the axis-angle of a small motion jumps to the other side."""
+    angle = middle + np.deg2rad([0, -20, 15, 5])
+    rotations = Rotation.from_rotvec(np.outer(angle, [0.6, 0, 0.8])).as_rotvec()
+    assert measured(capture_of(joint=rotations)).motion_deg == pytest.approx(35, abs=1e-5)
+
+
+def test_motion_does_not_depend_on_how_rotations_are_written():
+    rotations = np.tile([0.2, -0.4, 0.3], (4, 1))
+    rotations[1] *= 1 - 2 * np.pi / np.linalg.norm(rotations[1])
+    rotations[2] *= 1 + 2 * np.pi / np.linalg.norm(rotations[2])
+    assert measured(capture_of(joint=rotations)).motion_deg < 1e-3
+    assert measured(capture_of(np.random.default_rng(0).normal(0, 1, (4, 3)))).motion_deg < 1e-3, "the root counts"
+
+
+# ------------------------------------------------------------------------------------------- what is left out
+
+
+def test_a_moving_person_keeps_the_pose_residual_and_a_static_one_does_not(moving):
+    static = measured(FakeCapture([a_pose(yaw) for yaw in np.linspace(0, 5, 6)], [a_camera()] * 4))
+    assert static.turn_deg > 180
+    left_out = leave_out(QUICK, static)
+    assert [(o.field, o.value) for o in left_out if o.field == "pose_residual"] == [("pose_residual", False)]
+    assert "0.0°" in next(o.reason for o in left_out if o.field == "pose_residual")
+    assert not [o for o in leave_out(QUICK, moving) if o.field == "pose_residual"]
+    assert not [o for o in leave_out(replace(QUICK, pose_residual=False), static) if o.field == "pose_residual"]
+
+
+@pytest.mark.parametrize(
+    ("pixel_mm", "levels"), [(1.0, (64, 128, 256)), (20.0, (64, 128)), (40.0, (64,)), (500.0, (64,))]
+)
+@pytest.mark.parametrize("config", [QUICK, PAPER], ids=["quick", "paper"])
+def test_levels_finer_than_the_pixels_are_left_out(moving, config, pixel_mm, levels):
+    """Texels of 23, 11.5 and 5.8 mm; the limit is a third of a pixel. However far the camera, one level stays."""
+    left_out = [o for o in leave_out(config, replace(moving, pixel_mm=pixel_mm)) if o.field == "levels"]
+    assert [o.value for o in left_out] == ([] if levels == config.levels else [levels])
+    assert all(f"{pixel_mm:.1f} mm" in o.reason for o in left_out)
+
+
+def test_a_far_camera_makes_the_pixels_coarse():
+    far = measured(FakeCapture([a_pose(k) for k in range(3)], [a_camera(distance=9.0, size=256)] * 4))
+    near = measured(FakeCapture([a_pose(k) for k in range(3)], [a_camera(size=256)] * 4))
+    assert far.pixel_mm == pytest.approx(3 * near.pixel_mm, rel=0.02)
+    assert leave_out(QUICK, far)[-1].value == (64,)
+
+
+def test_omissions_name_fields_of_the_configuration(moving):
+    for o in leave_out(QUICK, replace(moving, motion_deg=0.0, pixel_mm=40.0)):
+        assert o.value != getattr(QUICK, o.field)
+        assert getattr(replace(QUICK, **{o.field: o.value}), o.field) == o.value
+
+
+def test_regions_without_a_texel_are_absent_with_a_reason(moving):
+    assert absent_regions(moving, REGIONS) == []
+    nothing = replace(moving, hidden_texels=0.0, never_seen_texels=0.0)
+    assert [o.field for o in absent_regions(nothing, REGIONS)] == ["hidden", "never_seen"]
+    assert all(len(o.reason) > 20 for o in absent_regions(nothing, REGIONS))
+    assert absent_regions(nothing, ("body", "full")) == []
+    bare = measured(turning(), occlusion=fake_protocol(rule="none").occlusion)
+    assert [o.field for o in absent_regions(bare, REGIONS)] == ["hidden"]
+
+
+def test_only_some_of_many_views_are_read(monkeypatch):
+    """Every frame counts for motion, a few that are evenly spread for visibility."""
+    monkeypatch.setattr(plan, "MEASURE_VIEWS", 6)
+    poses = [a_pose(0.1 * k, arms=1.0 if k == 29 else 0.0) for k in range(51)]
+    read = set()
+    capture = FakeCapture(poses, [a_camera(size=48)] * 4, edit_silhouette=lambda c, f, pixels: read.add(f) or pixels)
+    found = measured(capture, occlusion=fake_protocol(rule="none").occlusion)
+    assert read == {0, 10, 20, 30, 40, 50}
+    assert found.training_views == 51
+    assert found.motion_deg > 50
+
+
+# ---------------------------------------------------------------------------------------------- expected time
+
+
+def a_run(seconds, method="inpainthuman", profile="quick", status="done"):
+    return {
+        "status": status,
+        "identity": {"method": method, "profile": profile},
+        "about": {"total_seconds": seconds},
+    }
+
+
+def test_expected_seconds_are_the_median_of_finished_runs_alike(tmp_path):
+    assert expected_seconds(tmp_path / "nowhere", "inpainthuman", "quick") is None
+    records = [a_run(10), a_run(30), a_run(100), a_run(999, status="failed"), a_run(5, profile="paper")]
+    records += [a_run(1, method="other"), {"status": "done"}, [], a_run("soon"), a_run(None)]
+    for k, record in enumerate(records):
+        (tmp_path / str(k)).mkdir()
+        (tmp_path / str(k) / "run.json").write_text(json.dumps(record))
+    (tmp_path / "cut").mkdir()
+    (tmp_path / "cut" / "run.json").write_text('{"status": "do')
+    assert expected_seconds(tmp_path, "inpainthuman", "quick") == 30
+    assert expected_seconds(tmp_path, "inpainthuman", "paper") == 5
+    assert expected_seconds(tmp_path, "another", "quick") is None
+
+
+def test_a_measure_can_be_made_by_hand():
+    """Methods of others build one for their own tests."""
+    scene = SceneMeasure(1, 0, 1, 0, 1, 0, 0, motion_deg=0, turn_deg=0, pixel_mm=3, surface_mm=1500, occlusion={})
+    assert [o.field for o in leave_out(QUICK, scene)] == ["pose_residual"]

@@ -1,0 +1,231 @@
+"""`ihbench run` from the command line to the run folder."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import ihbench
+from ihbench import registry
+from ihbench.atomic import read_json, read_json_lines
+from ihbench.calibration import ROWS, Calibration
+from ihbench.data_source import locate
+from ihbench.metrics import psnr
+from ihbench.progress import Progress
+from ihbench.protocol import load_protocol
+from ihbench.results import read_result
+from ihbench.scene import MaskState
+from ihbench.views import open_scene
+from tests.conftest import contents
+
+SWITCHES = {"texels": 32, "levels": (16, 256), "decoder_width": 32, "position_map": 16, "steps": 8}
+VIEWS = 4  # test views of the tiny protocol
+
+
+def by_view(folder):
+    """Every per-view score of a run's own row, to the last bit."""
+    return {(row["camera"], row["frame"]): row["scores"] for row in read_json_lines(folder / "scores.jsonl")}
+
+
+def means(folder, row="inpainthuman"):
+    return {identity: mean.value for identity, mean in read_result(folder).rows[row].items()}
+
+
+@pytest.fixture
+def no_fit(monkeypatch):
+    """Fitting is an error from here on."""
+
+    def fit(*_, **__):
+        raise AssertionError("fitted again")
+
+    monkeypatch.setattr(registry.load("method", "inpainthuman"), "fit", fit)
+
+
+# ------------------------------------------------------------------------------------------ what is left behind
+
+
+def test_a_run_ends_with_a_table_that_says_stand_in_and_with_a_complete_folder(finished):
+    assert finished.outcome.status == 0
+    assert "stand-in v1 seed 0" in finished.outcome.out
+    assert "| inpainthuman" in finished.outcome.out
+    assert str(finished.folder / "contact_sheet.png") in finished.outcome.out
+    files = {name for name in contents(finished.folder) if not name.startswith("renders/")}
+    assert files == {
+        "run.json",
+        "scores.jsonl",
+        "calibration.jsonl",
+        "curve.jsonl",
+        "contact_sheet.png",
+        "avatar/avatar.json",
+        "avatar/avatar.safetensors",
+        "checkpoints/stage1.safetensors",
+        "lock",
+    }
+    assert len(list((finished.folder / "renders").rglob("*.png"))) == VIEWS == len(by_view(finished.folder))
+    sheet = np.asarray(Image.open(finished.folder / "contact_sheet.png"))
+    assert len(np.unique(sheet.reshape(-1, 3), axis=0)) > 100
+
+
+def test_progress_goes_to_stderr_and_not_to_stdout(finished):
+    assert "zju_occ@1 standin-1" in finished.outcome.err
+    assert finished.outcome.out.startswith("## zju_occ@1")
+
+
+def test_the_numbers_are_those_of_the_pictures(finished, studio):
+    """PSNR of the renders on disk against the truth, region `full`: what scores.jsonl says, up to 8 bits."""
+    protocol = load_protocol(str(studio.protocol))
+    with studio.in_its_world():
+        capture, _ = locate(protocol, None, ("standin-1",)).open("standin-1", None, Progress.silent())
+        views = {(view.camera_id, view.frame): view.image for view in open_scene(capture, protocol).test}
+    scores = by_view(finished.folder)
+    assert views.keys() == scores.keys()
+    for (camera, frame), truth in views.items():
+        picture = Image.open(finished.folder / "renders" / camera / f"{frame:06d}.png")
+        here = psnr(np.asarray(picture, np.float32) / 255, truth)
+        assert here == pytest.approx(scores[camera, frame]["psnr/pooled/range1/full/v1"], abs=0.02)
+
+
+def test_truth_is_perfect_and_nothing_else_is(finished):
+    perfect = {"psnr": math.inf, "ssim": 1.0}
+    rows = read_result(finished.folder).rows
+    assert set(rows) == {"inpainthuman", *ROWS}
+    for identity, mean in rows["truth"].items():
+        assert mean.value == pytest.approx(perfect[identity.partition("/")[0]], abs=1e-12)
+        for row in set(rows) - {"truth", "truth-8bit"}:
+            assert rows[row][identity].value < mean.value
+
+
+def test_stages_add_up_to_the_wall_clock(finished):
+    record = read_json(finished.folder / "run.json")
+    *stages, total = record["ledger"]["table"]
+    top = {row["stage"]: row["seconds"] for row in stages if row["depth"] == 0}
+    assert total["stage"] == "total"
+    assert sum(top.values()) == pytest.approx(total["seconds"], rel=1e-9)
+    assert {"occlude", "load", "plan", "visibility", "fit", "evaluate", "score", "other"} <= set(top)
+    assert record["about"]["fit_seconds"] == pytest.approx(top["fit"])
+    assert 0 <= top["other"] < 0.5 * total["seconds"]
+
+
+def test_the_curve_ends_at_the_score(finished):
+    """The tiny protocol has fewer test views than the curve uses, so its last point must be the result."""
+    *_, last = read_json_lines(finished.folder / "curve.jsonl")
+    assert last["step"] == SWITCHES["steps"]
+    assert last["views"] == VIEWS
+    assert last["scores"] == means(finished.folder)
+    assert last["seconds"] <= read_json(finished.folder / "run.json")["about"]["fit_seconds"]
+
+
+def test_json_is_one_object_and_nothing_else(bench_with_run, finished):
+    outcome = bench_with_run.run("--json")
+    (line,) = outcome.out.splitlines()
+    told = json.loads(line, parse_constant=lambda name: pytest.fail(f"{name} is not strict JSON"))
+    assert (outcome.status, told["status"]) == (0, "done")
+    (run,) = told["runs"]
+    assert run["standin"] == "stand-in v1 seed 0"
+    assert run["scores"]["inpainthuman"] == means(finished.folder)
+    assert run["scores"]["truth"]["psnr/pooled/range1/full/v1"] == "inf"
+
+
+# --------------------------------------------------------------------------------------------- the same run
+
+
+@pytest.mark.usefixtures("no_fit")
+def test_the_same_run_is_found_and_its_folder_left_alone(bench_with_run, finished):
+    outcome = bench_with_run.run()
+    assert outcome.status == 0
+    assert [folder.name for folder in bench_with_run.folders()] == [finished.folder.name]
+    assert contents(bench_with_run.folders()[0]) == contents(finished.folder)
+    row = next(line for line in finished.outcome.out.splitlines() if "inpainthuman" in line)
+    assert row in outcome.out.splitlines()
+
+
+@pytest.mark.usefixtures("no_fit")
+def test_a_notebook_finds_the_run_of_the_command_line(bench_with_run, finished):
+    with bench_with_run.in_its_world():
+        protocol, runs = str(bench_with_run.protocol), bench_with_run.runs
+        result = ihbench.run(protocol, "standin-1", runs=runs, progress=Progress.silent(), **SWITCHES)
+    assert result.folder.name == finished.folder.name
+
+
+def test_force_repeats_the_run_bit_for_bit(bench_with_run, finished, monkeypatch):
+    fitted = []
+    method = registry.load("method", "inpainthuman")
+    fit = method.fit
+    monkeypatch.setattr(method, "fit", lambda self, *a, **k: fitted.append(1) or fit(self, *a, **k))
+    assert bench_with_run.run("--force").status == 0
+    (folder,) = bench_with_run.folders()
+    assert fitted
+    assert by_view(folder) == by_view(finished.folder)
+    again, before = contents(folder), contents(finished.folder)
+    assert again["avatar/avatar.safetensors"] == before["avatar/avatar.safetensors"]
+    assert {n for n in again if n.startswith("renders/") and again[n] != before[n]} == set()
+
+
+@pytest.mark.parametrize("change", ["--seed 1", "--method.steps 3", "--occlusion none"])
+def test_what_moves_the_answer_makes_another_run(bench_with_run, finished, change):
+    assert bench_with_run.run(*change.split()).status == 0
+    (other,) = {folder.name for folder in bench_with_run.folders()} - {finished.folder.name}
+    other = bench_with_run.runs / other
+    assert contents(bench_with_run.runs / finished.folder.name) == contents(finished.folder)
+    assert by_view(other).keys() == by_view(finished.folder).keys()
+    assert all(by_view(other)[view] != scores for view, scores in by_view(finished.folder).items())
+    theirs, ours = (read_json(folder / "run.json")["identity"] for folder in (other, finished.folder))
+    assert (theirs["protocol_digest"] != ours["protocol_digest"]) == ("--occlusion" in change)
+
+
+def test_every_seed_is_a_run_of_its_own(bench, mannequin):
+    outcome = bench.run("--seed", 0, 1, method=mannequin)
+    assert outcome.status == 0
+    assert [read_json(folder / "run.json")["identity"]["seed"] for folder in bench.folders()] == [0, 1]
+    assert "| mannequin | 1 | 0, 1 |" in outcome.out
+
+
+def test_calibration_is_computed_once_for_all_methods_and_seeds(bench_with_run, mannequin, monkeypatch):
+    assert bench_with_run.run(method=mannequin).status == 0
+    monkeypatch.setattr(Calibration, "build", lambda *_: pytest.fail("computed again"))
+    assert bench_with_run.run("--seed", 1, method=mannequin).status == 0
+    rows = {(folder / "calibration.jsonl").read_bytes() for folder in bench_with_run.folders()}
+    assert len(bench_with_run.folders()) == 3
+    assert len(rows) == 1
+
+
+# ------------------------------------------------------------------------- occlusion, and what the plan leaves out
+
+
+def test_only_occluded_frames_have_unknown_pixels_and_none_without_an_occluder(studio):
+    protocol = load_protocol(str(studio.protocol))
+    with studio.in_its_world():
+        capture, _ = locate(protocol, None, ("standin-1",)).open("standin-1", None, Progress.silent())
+    unknown = {
+        rule.occlusion.rule: [bool((v.mask == MaskState.UNKNOWN).any()) for v in open_scene(capture, rule).train]
+        for rule in (protocol, protocol.with_occlusion("none"))
+    }
+    assert unknown == {"fixed-strip": [True] * 4 + [False], "none": [False] * 5}
+
+
+def test_without_an_occluder_no_surface_is_hidden_and_the_table_says_why(bench, mannequin):
+    outcome = bench.run("--occlusion", "none", method=mannequin)
+    (folder,) = bench.folders()
+    about = read_json(folder / "run.json")["about"]
+    assert about["measure"]["hidden_texels"] == about["hidden_share"] == 0
+    assert [o["field"] for o in about["left_out"]] == ["hidden"]
+    assert math.isnan(means(folder, "mannequin")["psnr/pooled/range1/hidden/v1"])
+    assert "left out: hidden → None: every texel that faced the training camera was also seen" in outcome.out
+
+
+def test_the_plan_leaves_out_what_the_scene_cannot_use_and_says_so(finished):
+    (omission,) = read_json(finished.folder / "run.json")["about"]["left_out"]
+    assert (omission["field"], omission["value"]) == ("levels", [16])
+    assert read_json(finished.folder / "avatar" / "avatar.json")["config"]["levels"] == [16]
+    assert f"left out: levels → [16]: {omission['reason']}" in finished.outcome.out
+
+
+@pytest.mark.parametrize("kept", ["levels", "all"])
+def test_keep_holds_the_plan_back(bench, kept):
+    outcome = bench.run("--keep", kept, "--method.steps", 1)
+    (folder,) = bench.folders()
+    assert read_json(folder / "run.json")["about"]["left_out"] == []
+    assert read_json(folder / "avatar" / "avatar.json")["config"]["levels"] == [16, 256]
+    assert f"keep={kept}" in outcome.out

@@ -1,0 +1,165 @@
+"""Shared by the end-to-end tests: a tiny protocol, the stand-in pictures it reads, the command line, a finished run.
+
+Everything lies in temporary folders; nobody's cache, data or runs are touched.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import dataclass, field, replace
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from unittest.mock import patch
+
+import pytest
+
+from ihbench import registry
+from ihbench.cli import main
+from ihbench.data_source import STANDIN_SEED, standin_root, wanted_frames
+from ihbench.protocol import load_protocol
+
+# 5 training views (4 of them occluded), 2 × 2 test views, 64 px
+TINY_PROFILE = """[profile.quick]
+image = { size = 64 }
+train = { frames = { step = 100 } }
+test = { cameras = { step = 8 }, frames = { step = 480 } }
+"""
+# the second level is finer than 64 px can show: the plan leaves it out
+TINY_SWITCHES = [
+    *("--method.texels", "32", "--method.levels", "16", "256", "--method.decoder-width", "32"),
+    *("--method.position-map", "16", "--method.steps", "8"),
+]
+SCENES = ["standin-1", "standin-2"]
+
+
+def tiny_protocol(path: Path, *changes: tuple[str, str]) -> Path:
+    """Write zju_occ with a tiny quick profile, and with some (old, new) texts of the file replaced."""
+    text = (registry.package_folder("protocol", "zju_occ") / "zju_occ.toml").read_text(encoding="utf-8")
+    text = text[: text.index("[profile.quick]")] + TINY_PROFILE
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new, 1)
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a command left behind."""
+
+    status: int
+    out: str
+    err: str
+
+
+@dataclass(frozen=True)
+class Bench:
+    """The command line in this process, on the tiny protocol."""
+
+    protocol: Path
+    cache: Path
+    runs: Path
+    threads: int = field(default=1)  # tiny tensors: more threads only wait for each other
+
+    @property
+    def environment(self) -> dict[str, str]:
+        private = {name: value for name, value in os.environ.items() if not name.startswith("IHBENCH_")}
+        return private | {"IHBENCH_CACHE": str(self.cache), "OMP_NUM_THREADS": str(self.threads)}
+
+    @contextmanager
+    def in_its_world(self) -> Iterator[None]:
+        import torch
+
+        before = torch.get_num_threads()
+        torch.set_num_threads(self.threads)
+        try:
+            with patch.dict(os.environ, self.environment, clear=True):
+                yield
+        finally:
+            torch.set_num_threads(before)
+
+    def __call__(self, *words: object) -> Outcome:
+        """`ihbench WORDS`."""
+        out, err = io.StringIO(), io.StringIO()
+        with self.in_its_world(), redirect_stdout(out), redirect_stderr(err):
+            status = main([str(word) for word in words])
+        return Outcome(status, out.getvalue(), err.getvalue())
+
+    def run_words(self, *more: object, scene: str = "standin-1", method: str = "inpainthuman") -> list[str]:
+        words = ["run", "--protocol", self.protocol, "--runs", self.runs, "--scene", scene, "--method", method]
+        words += TINY_SWITCHES if method == "inpainthuman" else []
+        return [str(word) for word in (*words, *more)]
+
+    def run(self, *more: object, scene: str = "standin-1", method: str = "inpainthuman") -> Outcome:
+        """`ihbench run` under the tiny protocol."""
+        return self(*self.run_words(*more, scene=scene, method=method))
+
+    def folders(self) -> list[Path]:
+        """Run folders, oldest first."""
+        return sorted((p.parent for p in self.runs.glob("*/run.json")), key=lambda p: p.stat().st_ctime_ns)
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A finished run of standin-1, seed 0. Read it, copy it, never write into it."""
+
+    folder: Path
+    outcome: Outcome
+
+
+@pytest.fixture(scope="session")
+def studio(tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    """The tiny protocol, and a cache that holds the stand-in pictures it reads and no more."""
+    home = tmp_path_factory.mktemp("studio")
+    bench = Bench(tiny_protocol(home / "tiny.toml"), home / "cache", home / "runs")
+    standin = registry.load("stand-in", "zju_mocap")
+    with bench.in_its_world():
+        wanted = wanted_frames(load_protocol(str(bench.protocol)), standin)
+        standin.ensure(standin_root("zju_mocap"), STANDIN_SEED, SCENES, wanted)
+    return bench
+
+
+@pytest.fixture(scope="session")
+def finished(studio: Bench) -> Finished:
+    outcome = studio.run()
+    assert outcome.status == 0, outcome.err
+    (folder,) = studio.folders()
+    return Finished(folder, outcome)
+
+
+@pytest.fixture
+def bench(studio: Bench, tmp_path: Path) -> Bench:
+    """The command line with an empty runs folder of its own."""
+    return replace(studio, runs=tmp_path / "runs")
+
+
+@pytest.fixture
+def bench_with_run(bench: Bench, finished: Finished) -> Bench:
+    """The command line with a copy of the finished run in its runs folder."""
+    shutil.copytree(finished.folder, bench.runs / finished.folder.name)
+    return bench
+
+
+@pytest.fixture
+def mannequin(monkeypatch: pytest.MonkeyPatch) -> str:
+    """The name of a second method, registered as a third-party package would register it; it fits in no time."""
+    package, found = "tests.bench.mannequin", registry._found
+    points = {
+        "method": EntryPoint("mannequin", f"{package}.method:Mannequin", registry.GROUPS["method"]),
+        "config": EntryPoint("mannequin", f"{package}.config", registry.GROUPS["config"]),
+    }
+
+    def with_mannequin(kind: str) -> dict[str, EntryPoint]:
+        return found(kind) | ({"mannequin": points[kind]} if kind in points else {})
+
+    monkeypatch.setattr(registry, "_found", with_mannequin)
+    return "mannequin"
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Relative path -> bytes of every file below a folder."""
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}

@@ -1,0 +1,194 @@
+"""The Markdown tables: which runs share one, what a cell is the mean of, what is said beside the numbers."""
+
+import math
+import re
+from pathlib import Path
+
+import pytest
+
+from ihbench.metrics import Mean
+from ihbench.reports.markdown import write
+from ihbench.results import RunResult
+
+PSNR, SSIM = "psnr/pooled/range1/{}/v1", "ssim/gauss11-1.5/range1/{}/v1"
+REGIONS = ("full", "body", "hidden")
+
+
+def run(scene="a", method="ours", seed=0, psnr=20.0, ssim=0.5, truth=True, **changes):
+    """A finished run whose every region has the same PSNR and SSIM."""
+    means = {}
+    for region in REGIONS:
+        for identity, value in ((PSNR.format(region), psnr), (SSIM.format(region), ssim)):
+            means[identity] = Mean(value, identity, "nothing is hidden" if math.isnan(value) else "", n=4)
+    perfect = {i: Mean(math.inf if i.startswith("psnr") else 1.0, i, "", n=4) for i in means}
+    record = {
+        "status": changes.pop("status", "done"),
+        "reason": changes.pop("reason", ""),
+        "identity": {
+            "protocol": changes.pop("protocol", "p@1"),
+            "protocol_digest": changes.pop("digest", "abc"),
+            "profile": changes.pop("profile", "quick"),
+            "scene": scene,
+            "method": method,
+            "seed": seed,
+            "code": changes.pop("code", "1+old"),
+        },
+        "about": {
+            "standin": changes.pop("standin", "stand-in v1 seed 0"),
+            "headline": "body",
+            "changed": changes.pop("changed", []),
+            "left_out": changes.pop("left_out", []),
+            "fit_seconds": changes.pop("fit_seconds", 10.0),
+            "total_seconds": 20.0,
+            "peak_mb": changes.pop("peak_mb", 100.0),
+        },
+    }
+    assert not changes
+    rows = {method: means} | ({"truth": perfect} if truth else {})
+    return RunResult(Path("runs") / scene, record, rows if record["status"] == "done" else {})
+
+
+def tables(text):
+    """Title -> rows of the table below it, each a dictionary of cells by column head."""
+    found = {}
+    for part in text.split("## ")[1:]:
+        lines = [re.split(r"(?<!\\) ?\| ?", line)[1:-1] for line in part.splitlines() if line[:1] == "|"]
+        head, rows = (lines[0], lines[2:]) if lines else ([], [])
+        found[part.splitlines()[0]] = [dict(zip(head, row, strict=True)) for row in rows]
+    return found
+
+
+def row(text, label):
+    ((rows),) = tables(text).values()
+    (found,) = [cells for cells in rows if cells["method"] == label]
+    return found
+
+
+# ----------------------------------------------------------------------------------------------- which table
+
+
+@pytest.mark.parametrize(
+    "change", [{"protocol": "p@2"}, {"digest": "abd"}, {"profile": "paper"}, {"standin": ""}, {"standin": "other"}]
+)
+def test_runs_that_cannot_be_compared_never_share_a_table(change):
+    text = write([run(), run(scene="b", psnr=30.0, **change)])
+    assert text.count("## ") == 2
+    assert text.count("| ours | 1 | 0 | 20.00") == text.count("| ours | 1 | 0 | 30.00") == 1
+
+
+def test_runs_of_one_protocol_share_a_table_whatever_their_order():
+    runs = [run("a", psnr=10.0), run("a", "theirs", psnr=11.0), run("b", psnr=20.0), run("b", "theirs", psnr=21.0)]
+    for order in (runs, runs[::-1]):
+        text = write(order)
+        assert text.count("## ") == 1
+        assert row(text, "ours")["PSNR↑ full"] == "15.00"
+        assert row(text, "theirs")["PSNR↑ full"] == "16.00"
+
+
+def test_stand_ins_are_named_as_such_and_real_data_too():
+    assert "Data: **stand-in v1 seed 0**: made by the bench, not real data." in write([run()])
+    assert "Data: real data." in write([run(standin="")])
+
+
+# ---------------------------------------------------------------------------------------- what a cell means
+
+
+def test_every_scene_counts_once_however_many_seeds_it_has():
+    runs = [run("a", seed=seed, psnr=10.0 + 4 * seed) for seed in (0, 1, 2)]
+    cells = row(write([*runs, run("b", psnr=20.0)]), "ours")
+    assert cells["PSNR↑ full"] == "17.00"  # (14 + 20) / 2, not the mean of the four runs, 15.5
+    assert (cells["scenes"], cells["seeds"]) == ("2", "0, 1, 2")
+
+
+def test_other_switches_make_another_row():
+    text = write([run(psnr=10.0), run(psnr=30.0, changed=["steps=5"])])
+    assert row(text, "ours")["PSNR↑ full"] == "10.00"
+    assert row(text, "ours (steps=5)")["PSNR↑ full"] == "30.00"
+
+
+def test_runs_of_another_version_of_the_code_are_never_averaged_with_these():
+    text = write([run(psnr=10.0), run(psnr=30.0, code="1+new")])
+    assert row(text, "ours (code 1+old)")["PSNR↑ full"] == "10.00"
+    assert row(text, "ours (code 1+new)")["PSNR↑ full"] == "30.00"
+    assert "code" not in write([run(code="1+new"), run("b", code="1+new"), run("b", "theirs")])
+
+
+def test_a_scene_without_the_number_is_left_out_of_the_mean_and_noted():
+    text = write([run("a", psnr=10.0), run("b", psnr=math.nan)])
+    assert row(text, "ours")["PSNR↑ full"] == "10.00"
+    assert "- absent: hidden: nothing is hidden" in text
+
+
+def test_absent_and_infinite_numbers_are_no_numbers():
+    text = write([run(psnr=math.nan)])
+    assert row(text, "ours")["PSNR↑ full"] == "—"
+    assert row(text, "*truth*")["PSNR↑ full"] == "∞"
+    assert row(text, "*truth*")["SSIM↑ full"] == "1.0000"
+
+
+def test_decimals_follow_the_metric():
+    cells = row(write([run(psnr=12.3456, ssim=0.123456)]), "ours")
+    assert (cells["PSNR↑ full"], cells["SSIM↑ full"]) == ("12.35", "0.1235")
+
+
+def test_calibration_rows_count_every_scene_once_and_stand_below_the_methods():
+    text = write([run("a"), run("a", seed=1), run("a", "theirs"), run("b")])
+    ((rows),) = tables(text).values()
+    assert [cells["method"] for cells in rows] == ["ours", "theirs", "*truth*"]
+    assert row(text, "*truth*")["scenes"] == "2"
+    assert "- truth: the truth as prediction" in text
+
+
+def test_seconds_are_means_and_memory_is_the_largest():
+    cells = row(write([run(fit_seconds=10, peak_mb=100), run("b", fit_seconds=30, peak_mb=300)]), "ours")
+    assert (cells["fit s"], cells["total s"], cells["peak MB"]) == ("20", "20", "300")
+
+
+# ------------------------------------------------------------------------------------------- what is said
+
+
+def test_the_headline_region_is_bold_and_columns_keep_metrics_together():
+    ((rows),) = tables(write([run()])).values()
+    metrics = [head for head in rows[0] if head.startswith(("PSNR", "SSIM"))]
+    assert metrics == [f"{m}↑ {r}" for m in ("PSNR", "SSIM") for r in ("full", "**body**", "hidden")]
+
+
+def test_what_a_number_is_stands_below_the_table():
+    text = write([run()])
+    assert "`psnr/pooled/range1/REGION/v1`" in text
+    assert "`ssim/gauss11-1.5/range1/REGION/v1`" in text
+    assert "Protocol digest `abc`" in text
+
+
+def test_a_run_that_is_not_done_is_named_with_its_reason_and_never_averaged():
+    bad = run("b", status="diverged", reason="diverged at step 3: loss is nan")
+    text = write([run("a", psnr=10.0), bad])
+    assert "Not done: ours on b: diverged (diverged at step 3: loss is nan)." in text
+    assert row(text, "ours")["scenes"] == "1"
+    alone = write([bad])
+    assert "Not done: ours on b" in alone
+    assert "|" not in alone
+
+
+def test_views_that_a_mean_does_not_run_over_are_counted():
+    result = run()
+    for identity in (PSNR.format("full"), SSIM.format("full")):
+        result.rows["ours"][identity] = Mean(20.0, identity, "region is empty", n=3, absent_count=1)
+    result.rows["ours"][PSNR.format("body")] = Mean(20.0, PSNR.format("body"), "", n=2, infinite=2)
+    text = write([result])
+    assert text.count("- full of a: 1 of 4 absent: region is empty") == 1
+    assert "- body of a: 2 of 4 without any error (inf) left out" in text
+
+
+def test_what_was_left_out_is_said_once():
+    left_out = [{"field": "levels", "value": [16], "reason": "too fine"}]
+    text = write([run("a", left_out=left_out), run("b", left_out=left_out)])
+    assert text.count("- left out: levels → [16]: too fine") == 1
+
+
+def test_words_from_elsewhere_cannot_break_the_table():
+    odd = run("b", status="failed", reason="no\n| such | thing <script>")
+    text = write([run(method="a|b", changed=["path=x|y\nz"]), odd])
+    ((rows),) = tables(text).values()
+    assert [cells["method"] for cells in rows] == [r"a\|b (path=x\|y z)", "*truth*"]
+    assert r"failed (no \| such \| thing &lt;script>)." in text
