@@ -28,15 +28,19 @@ def error_image(prediction: NDArray[np.float32], truth: NDArray[np.float32]) -> 
     return np.repeat(_to_8bit(error), 3, -1)
 
 
-def contact_sheet(rows: Sequence[SheetRow], title: str) -> NDArray[np.uint8]:
-    """[H, W, 3] one row of four images per view, cut to the person, under a title line and column heads."""
+def contact_sheet(rows: Sequence[SheetRow], title: str, zoom: int = 1) -> NDArray[np.uint8]:
+    """[H, W, 3] one row of four images per view, cut to the person, under a title line and column heads.
+
+    `zoom` repeats every pixel that many times in both directions, so that small images can be judged by eye.
+    """
     from PIL import Image, ImageDraw
 
     cells = []
     for row in rows:
         images = (row.training, _to_8bit(row.truth), _to_8bit(row.prediction), error_image(row.prediction, row.truth))
         window = _window(row)
-        cells.append([images[0][_window_of(row.training)]] + [image[window] for image in images[1:]])
+        cut = [images[0][_window_of(row.training)]] + [image[window] for image in images[1:]]
+        cells.append([image.repeat(zoom, 0).repeat(zoom, 1) for image in cut])
     height = max(cell.shape[0] for line in cells for cell in line)
     width = max(cell.shape[1] for line in cells for cell in line)
     width = max(width, 110)

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
 CURVE_VIEWS = 6  # test views on which the quality-time curve is measured
 SHEET_VIEWS = 5  # test views on the contact sheet
+SHEET_SIZE = 512  # px; smaller images are enlarged on it by a whole factor
 TRACEBACK = "traceback.txt"  # of a run that failed, in its folder
 
 
@@ -217,6 +218,8 @@ class _Run:
         }
 
     def _run(self) -> None:
+        from ihbench.render.splat import warm_up  # brings torch, which `ihbench plan` must not load
+
         request, protocol = self.request, self.request.protocol
         with self.ledger.stage("occlude"):
             scene = open_scene(self.capture, protocol)
@@ -234,7 +237,9 @@ class _Run:
             hidden_share=hidden_fraction(scene),
         )
         self.folder.set_status("running", ledger=self.ledger)
-        method: Method = registry.load("method", request.method)(config)
+        with self.ledger.stage("compile"):
+            method: Method = registry.load("method", request.method)(config)
+            warm_up(request.device)
         training = TrainingSet(scene.train, self.body, protocol.image.background, self.capture.name)
         with self.ledger.stage("fit"):
             avatar = method.fit(
@@ -291,9 +296,10 @@ class _Run:
         atomic.write_json_lines(self.folder.path / "calibration.jsonl", lines)
         self.folder.write_scores(view_rows(name, results[name]))
         title = f"{self.folder.identity['protocol']}  {self.capture.name}  {name}  {self.request.protocol.profile}"
+        zoom = max(1, SHEET_SIZE // self.request.protocol.image.size)
         if self.capture.standin:
             title += f"  ({self.capture.standin})"
-        write_png(self.folder.path / "contact_sheet.png", contact_sheet(sheet, title))
+        write_png(self.folder.path / "contact_sheet.png", contact_sheet(sheet, title, zoom))
 
     def _calibration_file(self) -> Path:
         """Calibration rows depend on data and protocol only: they are computed once for all methods and seeds."""

@@ -75,6 +75,17 @@ def render_gaussians(
     return rgb.to(means.dtype), alpha.to(means.dtype)
 
 
+def warm_up(device: str = "cpu") -> None:
+    """Draw two Gaussians forward and backward, so that the back end's compilation is not charged to whoever draws
+    first. Takes many seconds the first time after installation, milliseconds later (compiled code is kept)."""
+    camera = Camera(np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]), np.eye(3), np.zeros(3), 8, 8)
+    means = torch.tensor([[0.0, 0, 1], [0.1, 0, 2]], device=device, requires_grad=True)
+    scales = torch.full((2,), 0.1, device=device, requires_grad=True)
+    colors = torch.full((2, 3), 0.5, device=device, requires_grad=True)
+    rgb, alpha = render_gaussians(means, scales, colors, camera)
+    (rgb.sum() + alpha.sum()).backward()
+
+
 def project_gaussians(means: Tensor, scales: Tensor, colors: Tensor, camera: Camera) -> Splats:
     """World Gaussians -> splats of this camera, without those behind the near plane and the non-finite ones.
 

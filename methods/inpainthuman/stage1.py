@@ -89,10 +89,11 @@ def loss_of(avatar: GaussianAvatar, target: Target, background: tuple[float, flo
     if config.paper_strict:
         return loss
     loss = loss + config.background_weight * (error * target.background).sum() / visible
+    n = max(len(offset), 1)  # a body behind the camera leaves no point
     return (
         loss
-        + config.offset_weight * offset.square().mean()
-        + config.scale_weight * scale.mean()
+        + config.offset_weight * offset.square().sum() / (3 * n)
+        + config.scale_weight * scale.sum() / n
         + config.feature_weight * avatar.features.table.square().mean()
     )
 
