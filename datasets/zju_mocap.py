@@ -12,6 +12,7 @@ tools/prepare_zju_mocap. Parameter files are numbered as the images are, which i
 
 from __future__ import annotations
 
+import hashlib
 import io
 import pickle
 import re
@@ -164,6 +165,14 @@ class ZjuCapture:
             person = here if person is None else person | here
         assert person is not None
         return person
+
+    def content_digest(self, camera: int, frame: int, source: str = "mask") -> bytes:
+        """Hash of the bytes of one view's image and mask files; a missing file counts as empty."""
+        kinds = SILHOUETTES.get(source, ())
+        digest = hashlib.sha256()
+        for path in (self.image_path(camera, frame), *(self.mask_path(camera, frame, kind) for kind in kinds)):
+            digest.update(path.read_bytes() if path.is_file() else b"")
+        return digest.digest()
 
     def number(self, frame: int) -> int:
         """The number that the frame's parameter and vertex files carry; 313 and 315 count from 1."""

@@ -76,7 +76,7 @@ def write_png(path: Path, image: NDArray[np.uint8]) -> None:
 
 
 def _to_8bit(image: NDArray[np.float32]) -> NDArray[np.uint8]:
-    return np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
+    return np.round(np.clip(np.nan_to_num(image), 0, 1) * 255).astype(np.uint8)
 
 
 def _window(row: SheetRow) -> tuple[slice, slice]:

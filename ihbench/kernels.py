@@ -7,12 +7,10 @@ from __future__ import annotations
 
 import ctypes
 import json
-import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -338,19 +336,13 @@ def _peak_mib(step: Callable[[], object]) -> float | None:
     """Memory that a step needs while it runs, in MiB; None where the system cannot say (not Linux with glibc)."""
     try:
         ctypes.CDLL(None).malloc_trim(0)  # give back what earlier steps left, or this one would need nothing new
-        Path("/proc/self/clear_refs").write_text("5")  # resets the high-water mark
-        before = _status_kib("VmRSS")
-        step()
-        return max(0.0, (_status_kib("VmHWM") - before) / 1024)
     except (OSError, AttributeError):
         return None
-
-
-def _status_kib(field: str) -> int:
-    match = re.search(rf"^{field}:\s+(\d+) kB", Path("/proc/self/status").read_text(), re.MULTILINE)
-    if match is None:
-        raise OSError(f"/proc/self/status: no {field}")
-    return int(match.group(1))
+    before = machine.process_memory_mb("VmRSS")
+    if before is None or not machine.reset_peak_memory():
+        return None
+    step()
+    return max(0.0, machine.peak_memory_mb() - before)
 
 
 def _print_table(about: Row, rows: list[Row]) -> None:

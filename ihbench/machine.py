@@ -59,13 +59,39 @@ def memory_gb() -> float | None:
 
 
 def peak_memory_mb() -> float:
-    """MiB, the most main memory this process has held so far."""
+    """MiB, the most main memory this process has held, since `reset_peak_memory` where the system can reset it."""
+    peak = process_memory_mb("VmHWM")
+    if peak is not None:
+        return peak
     try:
         import resource
     except ImportError:  # Windows
         return float("nan")
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 2**20 if sys.platform == "darwin" else peak / 2**10
+
+
+def reset_peak_memory() -> bool:
+    """Forget the peak so far, so that one run's peak is not charged to the next in the same process.
+
+    True where that is possible (Linux).
+    """
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return False
+    return True
+
+
+def process_memory_mb(field: str) -> float | None:
+    """MiB of a field of /proc/self/status ("VmRSS" now, "VmHWM" at most); None where there is no such file."""
+    try:
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith(field + ":"):
+                return int(line.split()[1]) / 2**10
+    except OSError:
+        pass
+    return None
 
 
 def peak_device_memory_mb() -> float:

@@ -43,9 +43,17 @@ class RunResult:
 
     @property
     def group(self) -> tuple[str, str, str, str]:
-        """Runs of one group may stand in one table: protocol, its digest, profile, real or stand-in."""
+        """Runs of one group may stand in one table: protocol, its digest, profile, which data."""
+        identity = self.identity
+        return identity["protocol"], identity["protocol_digest"], identity["profile"], self.data
+
+    @property
+    def data(self) -> str:
+        """What the run was made on, as a table names it."""
         about = self.record["about"]
-        return self.identity["protocol"], self.identity["protocol_digest"], self.identity["profile"], about["standin"]
+        if about["standin"]:
+            return f"**{about['standin']}**: made by the bench, not real data"
+        return f"real data ({about['variant']})"
 
 
 def view_rows(row: str, scores: Iterable[ViewScores]) -> list[dict[str, Any]]:
@@ -79,7 +87,7 @@ def mean_rows(lines: Iterable[dict[str, Any]]) -> dict[str, dict[str, Mean]]:
 def read_result(folder: Path) -> RunResult:
     """Read a run folder. Raises `BadInput` when it is none or is damaged."""
     record = RunFolder.open(folder).record
-    if not record["identity"].keys() >= NAMED_BY or "standin" not in record["about"]:
+    if not record["identity"].keys() >= NAMED_BY or not record["about"].keys() >= {"standin", "variant"}:
         raise BadInput(f"{folder}: run.json is not a run record of this bench")
     lines: list[dict[str, Any]] = []
     for name in ("scores.jsonl", "calibration.jsonl"):

@@ -6,6 +6,7 @@ divergence and interruption are outcomes with a reason.
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import traceback
 from collections.abc import Callable
@@ -119,11 +120,23 @@ def run_scene(request: RunRequest, source: DataSource, scene: str, progress: Pro
     """Run on one scene, or find the finished run."""
     capture, body = source.open(scene, request.body, progress)
     identity = run_identity(request, capture, body)
-    about = {"standin": capture.standin, "headline": request.protocol.headline, "device": request.device}
+    about = {
+        "standin": capture.standin,
+        "variant": capture.variant,
+        "headline": request.protocol.headline,
+        "device": request.device,
+    }
     folder = RunFolder.create(request.runs, identity, about, request.force)
     with folder.lock():
         if not folder.finished:
-            _Run(request, capture, body, folder, progress).guarded()
+            gc.collect()  # what an earlier run in this process left in cycles is not this run's memory
+            machine.reset_peak_memory()
+            try:
+                _Run(request, capture, body, folder, progress).guarded()
+            except BaseException:
+                folder.settle(keep_new=False)
+                raise
+            folder.settle(keep_new=True)
     return read_result(folder.path)
 
 
@@ -272,7 +285,7 @@ class _Run:
         assert self.scorer is not None
         name, cached = self.request.method, self._calibration_file()
         rows: dict[str, Callable[[TestView], NDArray[np.float32]]] = {name: lambda view: self._render(avatar, view)}
-        lines = atomic.read_json_lines(cached) if cached.is_file() else None
+        lines = atomic.read_json_lines(cached) if cached.is_file() and not self.request.force else None
         if lines is None:
             calibration = Calibration.build(
                 scene.train, self.body, self.scorer.texels, scene.protocol.image.background
@@ -343,20 +356,27 @@ def _sheet_row(scene: OccludedScene, loaded: LoadedView, image: NDArray[np.float
 
 
 def _capture_digest(capture: Capture, protocol: Protocol) -> str:
-    """Hash of the cameras and body poses that the protocol uses of a capture."""
+    """Hash of the cameras, body poses, images and masks that the protocol uses of a capture."""
     digest = hashlib.sha256()
-    cameras = [protocol.train_camera, *protocol.testing_cameras(len(capture.camera_ids))]
-    for index in cameras:
+    n_frames = capture.n_frames
+    trained = [(protocol.train_camera, frame) for frame in protocol.training_frames(capture.name, n_frames)]
+    tested = [
+        (camera, frame)
+        for camera in protocol.testing_cameras(len(capture.camera_ids))
+        for frame in protocol.testing_frames(capture.name, n_frames)
+    ]
+    views = [(camera, frame) for camera, frame in trained + tested if frame < n_frames]
+    for index in dict.fromkeys(camera for camera, _ in views):
         camera = capture.camera(index)
         distortion = np.zeros(5) if camera.distortion is None else camera.distortion
         for value in (camera.K, camera.R, camera.t, distortion, np.array([camera.width, camera.height])):
             digest.update(np.ascontiguousarray(value, np.float64).tobytes())
-    frames = protocol.training_frames(capture.name, capture.n_frames)
-    for frame in sorted({*frames, *protocol.testing_frames(capture.name, capture.n_frames)}):
-        if frame < capture.n_frames:
-            pose = capture.body_pose(frame)
-            for value in (pose.pose, pose.betas, pose.transl):
-                digest.update(np.ascontiguousarray(value).tobytes())
+    for frame in sorted({frame for _, frame in views}):
+        pose = capture.body_pose(frame)
+        for value in (pose.pose, pose.betas, pose.transl):
+            digest.update(np.ascontiguousarray(value).tobytes())
+    for camera, frame in views:
+        digest.update(capture.content_digest(camera, frame, protocol.silhouette))
     return digest.hexdigest()[:10]
 
 

@@ -106,6 +106,11 @@ class Capture(Protocol):
         """[H, W, 3] RGB."""
         ...
 
+    def content_digest(self, camera: int, frame: int, source: str = "mask") -> bytes:
+        """Hash of one view's stored image and masks, undecoded: other files are other data. Never raises for a file
+        that is missing; reading it will."""
+        ...
+
     def silhouette(self, camera: int, frame: int, source: str = "mask") -> NDArray[np.bool_]:
         """[H, W]. `source` is a data-set specific choice of mask files; a protocol names it."""
         ...

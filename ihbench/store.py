@@ -89,7 +89,8 @@ class RunFolder:
         """The folder of this run, new or as an earlier process left it.
 
         A finished run is found, not begun again (see `finished`); one that was cut short keeps its checkpoints and
-        its ledger, to be resumed. `force` empties the folder first. A damaged run.json is kept beside as
+        its ledger, to be resumed. `force` sets a finished run aside until `settle`, and
+        empties the folder otherwise. A damaged run.json is kept beside as
         run.json.damaged, and the run starts again with a warning. `about` holds what a reader should know and no
         identity needs (whether the data are a stand-in, the device). Hold `lock()` while writing. Raises `BadInput`
         when the folder cannot be written, belongs to another run, or to a newer version of this bench.
@@ -97,7 +98,7 @@ class RunFolder:
         path = Path(runs) / identity.folder_name
         if force:
             with _locked(path):
-                _empty(path)
+                _set_aside(path)
         warnings = []
         if (path / "run.json").exists():
             try:
@@ -224,6 +225,17 @@ class RunFolder:
         if len(kept) < len(points):
             atomic.write_json_lines(self.path / "curve.jsonl", kept)
 
+    def settle(self, keep_new: bool) -> None:
+        """End a forced run: forget the finished run it replaces, or bring that one back. Call it inside `lock()`."""
+        old = _aside(self.path)
+        if not old.is_dir():
+            return
+        if not keep_new:
+            _empty(self.path)
+            for entry in old.iterdir():
+                os.replace(entry, self.path / entry.name)
+        shutil.rmtree(old)
+
     @contextmanager
     def lock(self) -> Iterator[None]:
         """Keep other processes from writing this run, and read again what they may have written before.
@@ -272,8 +284,12 @@ def _locked(path: Path) -> Iterator[None]:
     """The system's own file lock: it ends with the process however that ends, so a stale one is never in the way."""
     import fcntl
 
-    path.mkdir(parents=True, exist_ok=True)
-    with open(path / "lock", "a+", encoding="utf-8") as file:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        lock = open(path / "lock", "a+", encoding="utf-8")  # noqa: SIM115 (closed below)
+    except OSError as error:
+        raise BadInput(f"{path}: cannot be written ({error.strerror}); choose another --runs folder") from error
+    with lock as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
@@ -290,6 +306,30 @@ def _locked(path: Path) -> Iterator[None]:
         finally:
             file.truncate(0)
             fcntl.flock(file, fcntl.LOCK_UN)
+
+
+def _aside(path: Path) -> Path:
+    """Where a finished run waits while a forced one takes its place; too deep for reports to find it."""
+    return path.parent / "replaced" / path.name
+
+
+def _set_aside(path: Path) -> None:
+    """Make room for a forced run. What is not finished is not worth keeping."""
+    old = _aside(path)
+    if path.is_symlink() or not (path / "run.json").is_file() or old.exists():
+        _empty(path)
+        return
+    try:
+        finished = RunFolder.open(path).finished
+    except BadInput:
+        finished = False
+    if not finished:
+        _empty(path)
+        return
+    old.mkdir(parents=True)
+    for entry in path.iterdir():
+        if entry.name != "lock":
+            os.replace(entry, old / entry.name)
 
 
 def _empty(path: Path) -> None:

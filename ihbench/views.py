@@ -96,6 +96,8 @@ class Undistorter:
         import cv2
 
         self._cv2, self._rule = cv2, rule
+        # whole levels: what is known background and what is painted over must not differ by a rounding
+        self.background = np.round(np.asarray(rule.background) * 255).astype(np.uint8)  # [3]
         self._flags = {
             "nearest": cv2.INTER_NEAREST,
             "linear": cv2.INTER_LINEAR,
@@ -125,11 +127,10 @@ class Undistorter:
 
     def composite(self, image: NDArray[np.uint8], silhouette: NDArray[np.bool_]) -> NDArray[np.uint8]:
         """The person of the original image on the protocol's background, undistorted, resampled, 8 bit."""
-        background = np.asarray(self._rule.background, np.float32) * 255
         alpha = self.straighten(silhouette.astype(np.uint8) * 255).astype(np.float32)[..., None] / 255
         if self._rule.edge == "hard":
             alpha = (alpha >= 0.5).astype(np.float32)
-        full = self.straighten(image) * alpha + background * (1 - alpha)
+        full = self.straighten(image) * alpha + self.background * (1 - alpha)
         small = np.clip(self.shrink(full, self._rule.resample_image), 0, 255)
         return (small + (0.5 if self._rule.to_8bit == "round" else 1e-3)).astype(np.uint8)
 
@@ -150,14 +151,11 @@ def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
 
     Raises `BadInput` when the capture has fewer frames or cameras than the protocol needs.
     """
-    frames_needed = max(
-        protocol.training_frames(capture.name, capture.n_frames)
-        + protocol.testing_frames(capture.name, capture.n_frames),
-        default=-1,
-    )
-    if frames_needed < 0:
+    training = protocol.training_frames(capture.name, capture.n_frames)
+    frames_needed = max(training + protocol.testing_frames(capture.name, capture.n_frames), default=-1)
+    if not training:
         raise BadInput(
-            f"{capture.dataset} {capture.name}: {protocol.name} selects no frame of its {capture.n_frames}"
+            f"{capture.dataset} {capture.name}: {protocol.name} selects no training frame of its {capture.n_frames}"
         )
     if frames_needed >= capture.n_frames:
         raise BadInput(
@@ -182,14 +180,17 @@ def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
     def train_view(k: int) -> TrainView:
         lens, frame = undistort[protocol.train_camera], frames[k]
         person = silhouette(protocol.train_camera, frame)
+        image = capture.image(protocol.train_camera, frame)
         if covered[k]:
             person = person & ~hidden
+            # before anything is resampled: lens and kernel would carry hidden colours out of the strip
+            image = np.where(hidden[..., None], lens.background, image)
         state = np.where(lens.mask(person), MaskState.PERSON, MaskState.BACKGROUND).astype(np.uint8)
         if covered[k]:
             state[hidden_small] = MaskState.UNKNOWN
-        image = lens.composite(capture.image(protocol.train_camera, frame), person)
+        image = lens.composite(image, person)
         if covered[k]:
-            image[hidden_small] = np.round(np.asarray(protocol.image.background) * 255)
+            image[hidden_small] = lens.background
         return TrainView(
             image, state, lens.camera, capture.body_pose(frame), frame, capture.camera_ids[protocol.train_camera]
         )

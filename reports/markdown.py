@@ -23,10 +23,9 @@ def write(results: Sequence[RunResult]) -> str:
 
 
 def _group(key: tuple[str, str, str, str], runs: list[RunResult]) -> str:
-    protocol, digest, profile, standin = key
+    protocol, digest, profile, data = key
     done = [run for run in runs if run.status == "done"]
-    kind = f"**{standin}**: made by the bench, not real data" if standin else "real data"
-    head = [f"## {protocol}, {profile} profile", "", f"Data: {kind}. Protocol digest `{digest}`."]
+    head = [f"## {protocol}, {profile} profile", "", f"Data: {data}. Protocol digest `{digest}`."]
     head += [
         f"Not done: {_plain(f'{run.method} on {run.scene}')}: {run.status} ({_plain(run.record['reason'])})."
         for run in runs

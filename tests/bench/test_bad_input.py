@@ -5,6 +5,7 @@ import pickle
 import resource
 import shutil
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -269,7 +270,10 @@ def disk_full_for(part, monkeypatch):
     """Every file with `part` in its path lies on a device that is full."""
 
     def opened(path, mode="r", **more):
-        return open("/dev/full", "wb") if part in str(path) else open(path, mode, **more)
+        if part not in str(path):
+            return open(path, mode, **more)
+        Path(path).touch()
+        return open("/dev/full", "wb")
 
     with monkeypatch.context() as patch:
         patch.setattr(atomic, "open", opened, raising=False)

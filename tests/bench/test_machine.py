@@ -39,6 +39,13 @@ def test_peak_memory_sees_an_allocation():
     assert machine.peak_memory_mb() < before + size + 512
 
 
+def test_a_reset_forgets_an_earlier_peak():
+    np.ones(256 * 2**17)  # 256 MiB, given back at once
+    before = machine.peak_memory_mb()
+    assert machine.reset_peak_memory() == (sys.platform == "linux")
+    assert machine.peak_memory_mb() < before - 128 or sys.platform != "linux"
+
+
 def test_synchronize_takes_any_device_name():
     for device in ("cpu", "cuda", "cuda:0", "mps"):
         if device == "cpu" or not torch.cuda.is_available():

@@ -91,9 +91,12 @@ def test_one_frame_shows_one_side():
 def test_a_pixel_and_a_texel_in_millimetres(moving):
     assert moving.pixel_mm == pytest.approx(1000 * DISTANCE / (FOCAL * 48 / SIZE), rel=0.03)
     assert measured(turning(), image=fake_protocol(size=SIZE).image).pixel_mm == pytest.approx(moving.pixel_mm / 2)
-    # 1.8 m² of surface: about 2.4 cm at 64² and 0.6 cm at 256² (protocols.md sec. 8, item 11)
-    assert 18 < moving.texel_mm(64) < 28
-    assert moving.texel_mm(256) == pytest.approx(moving.texel_mm(64) / 4)
+    # about 2.4 cm at 64² and 0.6 cm at 256² (protocols.md sec. 8, item 11): together the texels make up the skin
+    corners = BODY.v_template[BODY.faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
+    for resolution in (64, 256):
+        texels = len(texel_table(BODY, resolution).face)
+        assert texels * moving.texel_mm(resolution) ** 2 / 1e6 == pytest.approx(area, rel=0.04)
 
 
 # ------------------------------------------------------------------------------------------ turn and motion

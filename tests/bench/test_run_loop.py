@@ -191,6 +191,16 @@ def test_calibration_is_computed_once_for_all_methods_and_seeds(bench_with_run, 
     assert len(rows) == 1
 
 
+def test_force_computes_the_calibration_again(bench, mannequin):
+    assert bench.run(method=mannequin).status == 0
+    (folder,), (shared,) = bench.folders(), (bench.runs / "calibration").iterdir()
+    before = (folder / "calibration.jsonl").read_bytes()
+    shared.write_bytes(before[: len(before) // 2])
+    assert bench.run("--seed", 1, method=mannequin).status == 2
+    assert bench.run("--force", method=mannequin).status == 0
+    assert (folder / "calibration.jsonl").read_bytes() == shared.read_bytes() == before
+
+
 # ------------------------------------------------------------------------- occlusion, and what the plan leaves out
 
 

@@ -116,6 +116,38 @@ def test_force_begins_again_but_follows_no_links(tmp_path):
     assert (tmp_path / "precious" / "file").read_text() == "x"
 
 
+@pytest.mark.parametrize("keep_new", [True, False])
+def test_a_forced_run_takes_the_old_ones_place_only_when_it_ends(tmp_path, keep_new):
+    old = RunFolder.create(tmp_path, IDENTITY)
+    (old.path / "scores.jsonl").write_text("old\n")
+    old.set_status("done")
+    new = RunFolder.create(tmp_path, IDENTITY, force=True)
+    assert new.path == old.path
+    assert new.status == "running"
+    assert not (new.path / "scores.jsonl").exists()
+    with new.lock():
+        new.settle(keep_new)
+    after = RunFolder.open(old.path)
+    assert after.status == ("running" if keep_new else "done")
+    assert (old.path / "scores.jsonl").exists() is not keep_new
+    assert not list((tmp_path / "replaced").iterdir())
+
+
+def test_a_run_cut_short_twice_under_force_still_finds_the_finished_one(tmp_path):
+    RunFolder.create(tmp_path, IDENTITY).set_status("done", "the first")
+    RunFolder.create(tmp_path, IDENTITY, force=True)  # killed
+    again = RunFolder.create(tmp_path, IDENTITY, force=True)
+    with again.lock():
+        again.settle(keep_new=False)
+    assert RunFolder.open(again.path).reason == "the first"
+
+
+def test_a_runs_folder_that_is_a_file_is_said(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(BadInput, match="--runs"):
+        RunFolder.create(tmp_path / "file", IDENTITY, force=True)
+
+
 def test_force_does_not_empty_a_run_in_use(tmp_path):
     run = RunFolder.create(tmp_path, IDENTITY)
     run.write_scores([{"a": 1}])

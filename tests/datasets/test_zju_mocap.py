@@ -523,3 +523,17 @@ def test_interrupted_write_leaves_the_old_file(written, tmp_path, monkeypatch):
 def test_writer_refuses_paths_that_do_not_match_the_cameras(written, tmp_path):
     with pytest.raises(ValueError, match="2 image paths a frame"):
         zju_mocap.write_annots(tmp_path, written[1], [["Camera_B1/000000.jpg"]])
+
+
+def test_the_content_digest_follows_the_files_of_its_own_view(copy):
+    capture = ZjuMocap(copy.parent).open("377")
+    views = [(camera, frame) for camera in range(N_CAMERAS) for frame in range(N_FRAMES)]
+    before = {view: capture.content_digest(*view) for view in views}
+    assert len(set(before.values())) == len(views)
+    for path in (capture.image_path(0, 1), capture.mask_path(1, 2)):
+        path.write_bytes(path.read_bytes() + b"\0")
+    union = capture.content_digest(1, 0, "union")
+    capture.mask_path(1, 0, "mask_cihp").unlink()
+    assert capture.content_digest(1, 0, "union") != union
+    changed = {view for view in views if capture.content_digest(*view) != before[view]}
+    assert changed == {(0, 1), (1, 2)}  # "mask" does not read mask_cihp

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scipy.ndimage import binary_erosion, distance_transform_edt
+from scipy.ndimage import binary_erosion, distance_transform_edt, maximum_filter
 from scipy.spatial.transform import Rotation
 
 from ihbench.body import CANONICAL_POSES, canonical_pose
@@ -222,6 +222,11 @@ def test_the_residual_starts_as_no_change_and_then_is_one():
     shaken(avatar)
     bent, straight = (avatar.decode(avatar.every_point, avatar.position_map(a_pose(0, arms))) for arms in (0.8, 0.0))
     assert all((a - b).abs().max() > 1e-4 for a, b in zip(bent, straight, strict=True))
+    avatar.residual_on = False
+    for a, b in zip(
+        avatar.decode(avatar.every_point, position_map), avatar.decode(avatar.every_point, None), strict=True
+    ):
+        assert torch.equal(a, b)
 
 
 def test_the_residual_knows_nothing_of_where_the_root_is():
@@ -327,15 +332,32 @@ def test_culling_hardly_changes_the_picture(texels, size, azimuth):
         assert np.abs(a - b).mean() <= 1e-3
 
 
-def test_culling_keeps_what_a_garment_hides_behind():
-    """Everything that the z-buffer shows of the body stays, whatever the distance."""
-    avatar = an_avatar(texels=128)
-    for distance in (1.2, 3.0, 12.0):
-        camera, pose = a_camera(0.5, SIZE, distance), a_pose(0, 0.5)
-        kept = np.zeros(len(avatar), bool)
-        kept[avatar.unhidden(camera, pose)] = True
-        nearest = rasterized(camera.scaled(512, 512), pose)
-        assert kept[np.isin(avatar.texels.face, np.unique(nearest.face))].mean() > 0.99
+def culled(avatar, camera, pose):
+    """Per point: kept or not, cosine between its normal and the view, m behind the farthest first surface around."""
+    kept = np.zeros(len(avatar), bool)
+    kept[avatar.unhidden(camera, pose)] = True
+    points = camera.project(on_the_surface(avatar, pose))
+    column, row = points[:, :2].astype(int).T
+    behind = points[:, 2] - maximum_filter(rasterized(camera, pose).depth, 3)[row, column]
+    corners = BODY.pose(pose)[BODY.faces[avatar.texels.face]]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return kept, (normals * (camera.center - corners.mean(1))).sum(1) / DISTANCE, behind
+
+
+def test_culling_goes_by_depth_with_room_for_offsets():
+    """Within 3 cm behind the first surface all stays, or 1 cm where turned away; what is far behind goes."""
+    avatar = an_avatar(texels=256)
+    views = [culled(avatar, a_camera(a, 256), a_pose(0, arms)) for a, arms in ((1.1, 0.3), (1.4, 0.9), (4.5, 0.6))]
+    kept, cosine, behind = (np.concatenate(part) for part in zip(*views, strict=True))
+    assert kept[behind < 0].all()
+    for near in ((cosine > 0) & (behind < 0.03), (cosine < -0.5) & (behind < 0.01)):
+        near &= behind > 0.004
+        assert near.sum() > 10
+        assert kept[near].all()
+    for deep in (behind > 0.06, (cosine < -0.5) & (behind > 0.03)):
+        assert deep.sum() > 1000
+        assert not kept[deep].any()
 
 
 @pytest.mark.parametrize("distance", [-3.0, 0.0, 0.3])

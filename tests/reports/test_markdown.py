@@ -35,6 +35,7 @@ def run(scene="a", method="ours", seed=0, psnr=20.0, ssim=0.5, truth=True, **cha
         },
         "about": {
             "standin": changes.pop("standin", "stand-in v1 seed 0"),
+            "variant": changes.pop("variant", "original/new_params"),
             "headline": "body",
             "changed": changes.pop("changed", []),
             "left_out": changes.pop("left_out", []),
@@ -87,7 +88,7 @@ def test_runs_of_one_protocol_share_a_table_whatever_their_order():
 
 def test_stand_ins_are_named_as_such_and_real_data_too():
     assert "Data: **stand-in v1 seed 0**: made by the bench, not real data." in write([run()])
-    assert "Data: real data." in write([run(standin="")])
+    assert "Data: real data (original/new_params)." in write([run(standin="")])
 
 
 # ---------------------------------------------------------------------------------------- what a cell means
