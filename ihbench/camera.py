@@ -70,12 +70,12 @@ class Camera:
         """
         p = self.to_camera(points)
         z = p[..., 2]
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             x, y = p[..., 0] / z, p[..., 1] / z
-        if self.distortion is not None:
-            x, y = distort(x, y, self.distortion)
-        u = self.K[0, 0] * x + self.K[0, 1] * y + self.K[0, 2]
-        v = self.K[1, 1] * y + self.K[1, 2]
+            if self.distortion is not None:
+                x, y = distort(x, y, self.distortion)
+            u = self.K[0, 0] * x + self.K[0, 1] * y + self.K[0, 2]
+            v = self.K[1, 1] * y + self.K[1, 2]
         return np.stack([u, v, z], -1)
 
     def scaled(self, width: int, height: int) -> Camera:

@@ -17,6 +17,8 @@ from unittest.mock import patch
 
 import pytest
 
+os.environ.setdefault("GOMP_SPINCOUNT", "10000")  # as the command line does; before anything imports torch
+
 from ihbench import registry
 from ihbench.cli import main
 from ihbench.data_source import STANDIN_SEED, standin_root, wanted_frames

@@ -102,6 +102,14 @@ def test_a_run_killed_while_scoring_ends_with_the_same_numbers(bench, finished):
     assert_continues_to_the_same_numbers(bench, finished, LAST)
 
 
+@pytest.fixture(autouse=True)
+def interruptible():
+    """A job started in the background inherits an ignored SIGINT; here it must interrupt."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def test_an_interrupted_run_says_so_and_continues(bench, finished, monkeypatch):
     with monkeypatch.context() as patch:
         offer, due_to_save = stop_at(STOPPED, lambda: signal.raise_signal(signal.SIGINT))

@@ -86,7 +86,7 @@ def read_protocol_text(text):
         ('headline = "body"', 'headline = "torso"', "headline"),
         ("[metrics]", "[metrix]", "metrics"),
         ("step = 5 }", "step = 0 }", "train.frames"),
-        ("image = { size = 256 }", "image = { sice = 256 }", "sice"),
+        ("image = { size = 256,", "image = { sice = 256,", "sice"),
         ("[image]", "[image", "p.toml"),
     ],
 )
