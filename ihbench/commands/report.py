@@ -20,6 +20,14 @@ class ReportOptions:
     """Run folders; none means every run under --runs."""
     runs: Path = Path("runs")
     """Folder of run folders."""
+    protocol: str | None = None
+    """Only runs under this protocol, with or without its @version."""
+    method: str | None = None
+    """Only runs of this method."""
+    scene: str | None = None
+    """Only runs on this scene."""
+    profile: str | None = None
+    """Only runs under this profile."""
     format: str = "md"
     """A registered report."""
     out: Path | None = None
@@ -30,10 +38,12 @@ def main(argv: list[str]) -> int:
     chosen = options(ReportOptions, argv, "report", "Tables of finished runs.")
     from ihbench.results import read_result
 
-    folders = chosen.run or tuple(sorted(p.parent for p in chosen.runs.glob("*/run.json")))
+    write = registry.load("report", chosen.format)
+    folders = chosen.run or _matching(chosen)
     if not folders:
         raise BadInput(
-            f"no run folders under {chosen.runs}; make one with: ihbench run --protocol zju_occ --scene standin-1"
+            f"no run folders under {chosen.runs} match; "
+            "make one with: ihbench run --protocol zju_occ --scene standin-1"
         )
     results = []
     for folder in folders:
@@ -43,9 +53,20 @@ def main(argv: list[str]) -> int:
             if chosen.run:
                 raise
             print(f"ihbench: left out: {error}", file=sys.stderr)
-    text = registry.load("report", chosen.format)(results)
+    text = write(results)
     if chosen.out is None:
         print(text, end="")
     else:
         atomic.write_text(chosen.out, text)
     return 0
+
+
+def _matching(chosen: ReportOptions) -> tuple[Path, ...]:
+    """Run folders under --runs that match the filters, from the index."""
+    from ihbench.index import Index
+
+    if not chosen.runs.is_dir():
+        return ()
+    wanted = {name: getattr(chosen, name) for name in ("protocol", "method", "scene", "profile")}
+    rows = Index(chosen.runs).query(**{name: value for name, value in wanted.items() if value is not None})
+    return tuple(chosen.runs / row["path"] for row in rows)

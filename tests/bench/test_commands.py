@@ -110,6 +110,21 @@ def test_a_report_can_name_its_runs_and_its_file(bench_with_run, mannequin, tmp_
     assert "| inpainthuman" not in text
 
 
+def test_a_report_can_be_narrowed_to_what_matches(bench_with_run, mannequin):
+    assert bench_with_run.run(method=mannequin).status == 0
+
+    def methods(*filters):
+        outcome = bench_with_run("report", "--runs", bench_with_run.runs, *filters)
+        return [name for name in ("inpainthuman", "mannequin") if f"| {name}" in outcome.out]
+
+    assert methods() == ["inpainthuman", "mannequin"]
+    assert methods("--method", "mannequin") == ["mannequin"]
+    assert methods("--protocol", "zju_occ", "--scene", "standin-1") == ["inpainthuman", "mannequin"]
+    outcome = bench_with_run("report", "--runs", bench_with_run.runs, "--scene", "nobody")
+    assert outcome.status == 2
+    assert "no run folders under" in outcome.err
+
+
 def test_a_damaged_run_does_not_take_the_others_with_it(bench_with_run, finished):
     damaged = bench_with_run.runs / "damaged"
     for name, spoil in {
