@@ -277,9 +277,7 @@ class _Run:
             identity: mean_over_frames([view.scores[identity] for view in rows["now"]]).value
             for identity in rows["now"][0].scores
         }
-        kept = [point for point in self.folder.curve() if point["step"] < step]
-        point = {"step": step, "seconds": seconds, "views": len(chosen), "scores": scores}
-        atomic.write_json_lines(self.folder.path / "curve.jsonl", [*kept, point])
+        self.folder.add_curve_point({"step": step, "seconds": seconds, "views": len(chosen), "scores": scores})
 
     def _score(self, scene: OccludedScene, avatar: Avatar) -> None:
         assert self.scorer is not None

@@ -215,15 +215,12 @@ class RunFolder:
         atomic.write_json_lines(self.path / "scores.jsonl", rows)
 
     def add_curve_point(self, point: Record) -> None:
-        """Append a quality-time point, `{"step": ..., "seconds": ..., ...}`."""
-        atomic.write_json_lines(self.path / "curve.jsonl", [*self.curve(), point])
+        """Append a quality-time point, `{"step": ..., "seconds": ..., ...}`.
 
-    def rewind_curve(self, seconds: float) -> None:
-        """Drop points later than `seconds` on the fit clock: a resumed fit makes them again."""
-        points = self.curve()
-        kept = [point for point in points if point["seconds"] <= seconds]
-        if len(kept) < len(points):
-            atomic.write_json_lines(self.path / "curve.jsonl", kept)
+        Points of this step or later are dropped: a resumed fit makes them again.
+        """
+        kept = [earlier for earlier in self.curve() if earlier["step"] < point["step"]]
+        atomic.write_json_lines(self.path / "curve.jsonl", [*kept, point])
 
     def settle(self, keep_new: bool) -> None:
         """End a forced run: forget the finished run it replaces, or bring that one back. Call it inside `lock()`."""
