@@ -13,7 +13,6 @@ import json
 import math
 import os
 import secrets
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -123,48 +122,9 @@ def decode(value: Any) -> Any:
     return value
 
 
-def replace_folder(temporary: Path, final: Path) -> None:
-    """Give a finished folder its name, in place of the folder that has it now.
-
-    Both must lie on one file system. No call swaps two folders everywhere, so for a moment the old one is called
-    `<name>.old`; if the process dies right then, `recover_folder` puts it back. Raises `BadInput` as `write_bytes`.
-    """
-    temporary, final = Path(temporary), Path(final)
-    recover_folder(final)
-    old = _old_name(final)
-    try:
-        if final.exists():
-            os.rename(final, old)
-        try:
-            os.rename(temporary, final)
-        except OSError:
-            if old.exists():
-                os.rename(old, final)
-            raise
-    except OSError as error:
-        raise _explained(error, final) from error
-    shutil.rmtree(old, ignore_errors=True)
-    _sync_folder(final.parent)
-
-
-def recover_folder(final: Path) -> None:
-    """Undo a `replace_folder` that was killed half way; does nothing otherwise."""
-    final = Path(final)
-    old = _old_name(final)
-    if old.is_dir():
-        if final.exists():
-            shutil.rmtree(old, ignore_errors=True)
-        else:
-            os.rename(old, final)
-
-
 def _beside(path: Path) -> Path:
     """A hidden name in the same folder, short enough whatever the file is called."""
     return path.parent / f".{path.name[:60]}.{os.getpid()}.{secrets.token_hex(4)}.tmp"
-
-
-def _old_name(final: Path) -> Path:
-    return final.parent / (final.name + ".old")
 
 
 def _remove_file(path: Path) -> None:
