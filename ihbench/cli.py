@@ -16,7 +16,10 @@ COMMANDS = {
     "protocol": "show every choice of a protocol, or where two differ",
     "plan": "what a run would do, what it leaves out and why; runs nothing",
     "data": "check a data folder, or write a stand-in capture",
+    "score": "score a folder of images that somebody else's code rendered",
     "report": "tables of finished runs",
+    "metrics": "check every metric against oracles, other libraries and stored values",
+    "weights": "learned weights the bench may not ship: list, where, fetch",
     "export": "an avatar's Gaussians as a splat PLY",
     "kernels": "error against milliseconds for the bench's own kernels",
 }

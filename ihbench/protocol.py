@@ -18,6 +18,7 @@ from ihbench import registry
 from ihbench.errors import BadInput
 
 REGIONS = ("full", "box", "body", "visible", "hidden", "never_seen")
+PROFILES = ("paper", "quick")  # every protocol has both
 RESAMPLING = ("nearest", "linear", "area", "lanczos4")
 
 
@@ -155,6 +156,14 @@ def read_protocol(path: Path, profile: str = "quick") -> Protocol:
         raise BadInput(f"protocol file {path}: key {error.args[0]!r} is missing") from error
     except (TypeError, ValueError) as error:
         raise BadInput(f"protocol file {path}: {error}") from error
+
+
+def protocol_from(content: dict[str, Any], profile: str, version: str) -> Protocol:
+    """The protocol of a run's record. Raises `BadInput` when the record holds none."""
+    try:
+        return replace(_build(content, profile), version=version)
+    except (KeyError, TypeError, ValueError) as error:
+        raise BadInput(f"recorded protocol: {error}") from error
 
 
 def _merge(base: dict[str, Any], override: dict[str, Any], path: Path, prefix: str = "") -> None:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.camera import Camera
+from ihbench.metrics.images import bounds
 from ihbench.render.zbuffer import NEAR, rasterize
 from ihbench.scene import TestView
 from ihbench.visibility import Visibility
@@ -42,9 +44,15 @@ class SurfaceMap:
     def regions(
         self, view: TestView, names: tuple[str, ...], box_padding: float
     ) -> dict[str, NDArray[np.bool_] | str]:
-        """Masks [H, W] of the named regions; a string instead of a mask says why a region is absent."""
+        """Masks [H, W] of the named regions; a string instead of a mask says why a region is absent.
+
+        `box` is padded by `box_padding` m, `box+0.3` by 0.3 m: released evaluators have paddings of their own. Raises
+        `ValueError` for a name that is none.
+        """
         vertices = self.body.pose(view.body_pose)
-        surface = self._surface_labels(vertices, view)
+        surface = np.zeros(0)
+        if {"visible", "hidden", "never_seen"} & set(names):
+            surface = self._surface_labels(vertices, view)
         every = {
             "full": lambda: np.ones_like(view.silhouette),
             "box": lambda: projected_box(vertices, view.camera, box_padding),
@@ -53,7 +61,16 @@ class SurfaceMap:
             "hidden": lambda: surface == HIDDEN,
             "never_seen": lambda: surface == NEVER_SEEN,
         }
-        return {name: every[name]() for name in names}
+        found = {}
+        for name in names:
+            padding = re.fullmatch(r"box\+([0-9.]+)", name)
+            if padding:
+                found[name] = projected_box(vertices, view.camera, float(padding[1]))
+            elif name in every:
+                found[name] = every[name]()
+            else:
+                raise ValueError(f"region {name!r}: expected one of {', '.join(every)}, or box+METRES")
+        return found
 
     def _surface_labels(self, vertices: NDArray[np.float64], view: TestView) -> NDArray[np.uint8]:
         """[H, W] label of every silhouette pixel, 0 elsewhere. Garments stand off the body, so silhouette pixels
@@ -70,8 +87,13 @@ class SurfaceMap:
         col = np.clip((uv[:, 0] * size).astype(int), 0, size - 1)
         row = np.clip(((1 - uv[:, 1]) * size).astype(int), 0, size - 1)
         labels[hit] = self.labels[row, col]
-        rows, cols = np.asarray(distance_transform_edt(~hit, return_distances=False, return_indices=True))
-        return np.where(view.silhouette, labels[rows, cols], 0).astype(np.uint8)
+        # the search stays in the rectangle that holds both the silhouette and the projected body
+        area = bounds(hit | view.silhouette)
+        assert area is not None
+        rows, cols = np.asarray(distance_transform_edt(~hit[area], return_distances=False, return_indices=True))
+        out = np.zeros_like(labels)
+        out[area] = np.where(view.silhouette[area], labels[area][rows, cols], 0)
+        return out
 
 
 def projected_box(vertices: NDArray[np.float64], camera: Camera, padding: float) -> NDArray[np.bool_]:

@@ -22,6 +22,7 @@ GROUPS = {
     "protocol": "ihbench.protocols",
     "occlusion": "ihbench.occlusions",
     "report": "ihbench.reports",
+    "metric preset": "ihbench.presets",
 }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ class RunResult:
     folder: Path
     record: dict[str, Any]  # run.json
     rows: dict[str, dict[str, Mean]]  # row name -> identity -> mean over the scene's test views
+    presets: dict[str, dict[str, dict[str, Mean]]] = field(default_factory=dict)  # preset scored later -> its rows
 
     @property
     def status(self) -> str:
@@ -95,10 +96,41 @@ def read_result(folder: Path) -> RunResult:
             lines += atomic.read_json_lines(folder / name)
     try:
         rows = mean_rows(lines)
+        presets = {
+            file.stem: mean_rows(atomic.read_json_lines(file)[1:])
+            for file in sorted((folder / "presets").glob("*.jsonl"))
+        }
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise BadInput(
             f"{folder}: its score files are damaged ({error}); run the same command with --force"
         ) from error
     if record["status"] == "done" and record["identity"]["method"] not in rows:
         raise BadInput(f"{folder}: is done, but its scores are gone; run the same command with --force")
-    return RunResult(folder, record, rows)
+    return RunResult(folder, record, rows, presets)
+
+
+def as_json(results: Iterable[RunResult]) -> dict[str, Any]:
+    """What `--json` prints of runs: strict JSON, numbers that are not finite as strings."""
+    results = list(results)
+    return {
+        "status": "done" if all(r.status == "done" for r in results) else "not done",
+        "runs": [
+            {
+                "folder": str(r.folder),
+                "scene": r.scene,
+                "method": r.method,
+                "seed": r.identity["seed"],
+                "status": r.status,
+                "reason": r.record["reason"],
+                "standin": r.record["about"]["standin"],
+                "scores": {
+                    row: {identity: atomic.encode(mean.value) for identity, mean in means.items()}
+                    for row, means in r.rows.items()
+                },
+                "fit_seconds": r.record["about"].get("fit_seconds"),
+                "total_seconds": r.record["about"].get("total_seconds"),
+                "peak_mb": r.record["about"].get("peak_mb"),
+            }
+            for r in results
+        ],
+    }

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.errors import BadInput
-from ihbench.metrics import evaluate
+from ihbench.machine import usable_cores
+from ihbench.metrics.evaluate import Preset, evaluate, find_preset
 from ihbench.metrics.identity import Score
 from ihbench.regions import SurfaceMap
 from ihbench.scene import TestView
@@ -23,7 +26,8 @@ if TYPE_CHECKING:
     from ihbench.body.uv import Texels
 
 VISIBILITY_TEXELS = 256  # side of the UV grid on which "seen in training" is decided
-AHEAD = 2  # test views read in the background while one is scored
+AHEAD = 3  # test views read in the background while one is predicted
+MOST_WORKERS = 8  # threads; each holds a view
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,18 @@ class LoadedView:
 
 
 @dataclass(frozen=True)
+class ScoredView:
+    """A test view with what was predicted for it and the scores of every row."""
+
+    loaded: LoadedView
+    images: dict[str, NDArray | None]  # row -> [H, W, 3] float in [0, 1] or uint8; None where there is none
+    scores: dict[str, ViewScores]  # row -> scores
+
+
+Predictor = Callable[[LoadedView], NDArray | None]  # -> [H, W, 3], or None where there is no prediction
+
+
+@dataclass(frozen=True)
 class Scorer:
     """Everything needed to score images of one scene; holds the truth, so methods never get it."""
 
@@ -52,53 +68,99 @@ class Scorer:
     surface: SurfaceMap
     texels: Texels
     visibility: Visibility
+    presets: tuple[Preset, ...]
 
     @classmethod
-    def build(cls, scene: OccludedScene, body: Body) -> Scorer:
-        """Decide from the training views what was seen of the surface."""
+    def build(cls, scene: OccludedScene, body: Body, presets: Sequence[str] | None = None) -> Scorer:
+        """Decide from the training views what was seen of the surface. The presets are the protocol's own by default.
+
+        Raises `BadInput` for an unknown preset.
+        """
         from ihbench.body.uv import texel_table
 
+        found = tuple(find_preset(name) for name in presets or scene.protocol.presets)
         texels = texel_table(body, VISIBILITY_TEXELS)
         visibility = texel_visibility(scene.train, body, texels)
-        return cls(scene, SurfaceMap.build(body, texels, visibility), texels, visibility)
+        return cls(scene, SurfaceMap.build(body, texels, visibility), texels, visibility, found)
+
+    @cached_property
+    def region_names(self) -> tuple[str, ...]:
+        """The protocol's regions, and those that the presets take or need beside them."""
+        names = list(self.scene.protocol.regions)
+        for preset in self.presets:
+            names += [*preset.regions(names), *preset.needs]
+        return tuple(dict.fromkeys(names))
 
     def load(self, index: int) -> LoadedView:
-        protocol, view = self.scene.protocol, self.scene.test[index]
-        regions = self.surface.regions(view, protocol.regions, protocol.box_padding)
+        view = self.scene.test[index]
+        regions = self.surface.regions(view, self.region_names, self.scene.protocol.box_padding)
         return LoadedView(index, self.scene.test_keys[index], view, regions)
 
-    def load_all(self, indices: Sequence[int]) -> Iterator[LoadedView]:
-        """The chosen test views in order, read ahead on other threads (decoding and drawing release the lock)."""
-        with ThreadPoolExecutor(AHEAD) as pool:
-            waiting = [pool.submit(self.load, index) for index in indices[: AHEAD + 1]]
-            for k in range(len(indices)):
-                loaded = waiting.pop(0).result()
-                if k + AHEAD + 1 < len(indices):
-                    waiting.append(pool.submit(self.load, indices[k + AHEAD + 1]))
-                yield loaded
-
-    def score(self, loaded: LoadedView, image: NDArray[np.float32]) -> ViewScores:
+    def score(self, loaded: LoadedView, image: NDArray | None, slow: bool = True) -> ViewScores:
         """Score one image. Raises `BadInput` when it has another size than the test view."""
-        if image.shape != loaded.view.image.shape:
+        protocol = self.scene.protocol
+        background = protocol.image.background
+        scores: dict[str, Score] = {}
+        if image is not None and image.shape != loaded.view.image.shape:
             raise BadInput(
                 f"prediction of {loaded.key.name}: has shape {image.shape}, expected {loaded.view.image.shape}"
             )
-        scores: dict[str, Score] = {}
-        for preset in self.scene.protocol.presets:
-            scores |= evaluate(image, loaded.view.image, loaded.regions, preset, self.scene.protocol.image.background)
+        for preset in self.presets:
+            if image is None:
+                scores |= preset.absent(protocol.regions, background, "no prediction of this view")
+            else:
+                scores |= evaluate(
+                    image, loaded.view.image, loaded.regions, preset, background, slow, protocol.regions
+                )
         return ViewScores(loaded.key, scores)
 
-    def score_rows(
+    def scored(
         self,
-        rows: dict[str, Callable[[TestView], NDArray[np.float32]]],
+        rows: dict[str, Predictor],
         indices: Sequence[int],
-        after_each: Callable[[LoadedView, dict[str, NDArray[np.float32]]], None],
-    ) -> dict[str, list[ViewScores]]:
-        """Score several predictors over the same test views, each view read once."""
-        results: dict[str, list[ViewScores]] = {name: [] for name in rows}
-        for loaded in self.load_all(indices):
-            images = {name: predict(loaded.view) for name, predict in rows.items()}
-            for name, image in images.items():
-                results[name].append(self.score(loaded, image))
-            after_each(loaded, images)
-        return results
+        *,
+        after_each: Callable[[LoadedView, dict[str, NDArray | None]], None] | None = None,
+        threaded: bool = False,
+        slow: bool = True,
+    ) -> Iterator[ScoredView]:
+        """Score several predictors over the same test views, in order, each view read once.
+
+        Reading, scoring and `after_each` (writing files, say) run on other threads beside the prediction, which runs
+        on this one, or also on those when the predictors allow it (`threaded`). A few views are held at a time. An
+        exception from any of them ends it.
+        """
+        workers = min(max(usable_cores(), 2), MOST_WORKERS)
+
+        def finish(loaded: LoadedView, images: dict[str, NDArray | None] | None) -> ScoredView:
+            if images is None:
+                images = {name: predict(loaded) for name, predict in rows.items()}
+            scores = {name: self.score(loaded, image, slow) for name, image in images.items()}
+            if after_each is not None:
+                after_each(loaded, images)
+            return ScoredView(loaded, images, scores)
+
+        def whole(index: int) -> ScoredView:
+            return finish(self.load(index), None)
+
+        with ThreadPoolExecutor(workers) as pool:
+            try:
+                waiting: deque[Future] = deque()
+                if threaded:
+                    for index in indices:
+                        waiting.append(pool.submit(whole, index))
+                        if len(waiting) > workers + AHEAD:
+                            yield waiting.popleft().result()
+                else:
+                    coming = deque(pool.submit(self.load, index) for index in indices[:AHEAD])
+                    for k in range(len(indices)):
+                        loaded = coming.popleft().result()
+                        if k + AHEAD < len(indices):
+                            coming.append(pool.submit(self.load, indices[k + AHEAD]))
+                        images = {name: predict(loaded) for name, predict in rows.items()}
+                        waiting.append(pool.submit(finish, loaded, images))
+                        if len(waiting) > workers:
+                            yield waiting.popleft().result()
+                while waiting:
+                    yield waiting.popleft().result()
+            finally:
+                pool.shutdown(wait=True, cancel_futures=True)

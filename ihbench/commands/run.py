@@ -65,6 +65,7 @@ def _run(chosen: Any) -> int:
     from ihbench.data_source import locate
     from ihbench.progress import Progress
     from ihbench.protocol import load_protocol
+    from ihbench.results import as_json
     from ihbench.run_loop import RunRequest, run_scene
 
     protocol = load_protocol(chosen.protocol, chosen.profile)
@@ -87,7 +88,7 @@ def _run(chosen: Any) -> int:
             results.append(run_scene(replace(request, seed=seed), source, scene, progress))
     text = registry.load("report", "md")(results)
     if chosen.json:
-        print(json.dumps(_as_json(results), allow_nan=False))
+        print(json.dumps(as_json(results), allow_nan=False))
     else:
         print(text)
         for result in results:
@@ -95,33 +96,6 @@ def _run(chosen: Any) -> int:
                 f"{result.scene}: {result.folder / 'contact_sheet.png' if result.status == 'done' else result.folder}"
             )
     return 0 if all(result.status == "done" for result in results) else 1
-
-
-def _as_json(results: list[Any]) -> dict[str, Any]:
-    from ihbench.atomic import encode
-
-    return {
-        "status": "done" if all(r.status == "done" for r in results) else "not done",
-        "runs": [
-            {
-                "folder": str(r.folder),
-                "scene": r.scene,
-                "method": r.method,
-                "seed": r.identity["seed"],
-                "status": r.status,
-                "reason": r.record["reason"],
-                "standin": r.record["about"]["standin"],
-                "scores": {
-                    row: {identity: encode(mean.value) for identity, mean in means.items()}
-                    for row, means in r.rows.items()
-                },
-                "fit_seconds": r.record["about"].get("fit_seconds"),
-                "total_seconds": r.record["about"].get("total_seconds"),
-                "peak_mb": r.record["about"].get("peak_mb"),
-            }
-            for r in results
-        ],
-    }
 
 
 def _check_keep(keep: tuple[str, ...], config: Any) -> None:

@@ -1,6 +1,6 @@
-"""Image metrics: numbers with an identity, held to a float64 oracle.
+"""Image metrics: numbers with an identity, held to a float64 oracle. `README.md` beside this has the rules on a page.
 
-Importing this package costs numpy only; cv2 is imported at the first SSIM, torch never.
+Importing this package costs numpy only; numba is imported at the first SSIM, torch at the first LPIPS.
 """
 
 from ihbench.metrics.aggregate import Mean, macro_mean, mean_over_frames

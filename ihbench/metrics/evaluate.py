@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import difflib
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ihbench import registry
 from ihbench.errors import BadInput
-from ihbench.metrics.identity import Identity, Score, background_part
-from ihbench.metrics.psnr import check_images, peak_of, pooled_psnr, squared_error
-from ihbench.metrics.ssim import differing_pixels, mean_ssim
+from ihbench.metrics.identity import Identity, Score
+from ihbench.metrics.images import Color, Mask, as_image, as_mask, check_images, differing_pixels
+from ihbench.metrics.psnr import SquaredError
 
-Color = tuple[float, float, float]
-Region = NDArray[np.bool_] | str | None  # a mask [H, W], the reason why there is none, or the whole frame
+Region = Mask | str | None  # a mask [H, W], the reason why there is none, or the whole frame
 
 
 @dataclass(frozen=True)
@@ -27,14 +27,15 @@ class Frame:
     pred: NDArray  # [H, W, C]
     truth: NDArray  # [H, W, C]
     background: Color
+    regions: Mapping[str, Region] = field(default_factory=dict)  # of the frame, for metrics that crop to one
 
     @cached_property
-    def squared_error(self) -> NDArray:
-        return squared_error(self.pred, self.truth)  # [H, W]
-
-    @cached_property
-    def differs(self) -> NDArray[np.bool_]:
+    def differs(self) -> Mask:
         return differing_pixels(self.pred, self.truth)  # [H, W]
+
+    @cached_property
+    def squared_error(self) -> SquaredError:
+        return SquaredError.of(self.pred, self.truth, self.differs)
 
 
 @dataclass(frozen=True)
@@ -46,70 +47,146 @@ class Measure:
     """
 
     identity: Callable[[str, Color], Identity]
-    compute: Callable[[Frame, NDArray[np.bool_] | None], float | str]
+    compute: Callable[[Frame, Mask | None], float | str]
+    about: str  # the definition in a line, for `ihbench list metrics`
+    regions: tuple[str, ...] | None = None  # the regions it is taken over; None for all that are asked for
+    slow: bool = False  # left out where only a glimpse is wanted, as on the quality-time curve
+    lacking: Callable[[], str] = str  # why it cannot be computed here; "" when it can
 
 
 @dataclass(frozen=True)
 class Preset:
-    """A named set of metrics and what is done to both images before them."""
+    """A named set of metrics and what is done to both images before them.
+
+    `prepare(pred, truth, regions, background)` returns both images, or a string that says why it cannot. `needs` are
+    regions that it or the measures read; a scorer provides them beside those that are asked for.
+    """
 
     name: str
     about: str
-    prepare: Callable[[NDArray, NDArray], tuple[NDArray, NDArray]]
+    source: str  # whose definition, to the line
+    prepare: Callable[[NDArray, NDArray, Mapping[str, Region], Color], tuple[NDArray, NDArray] | str]
     measures: tuple[Measure, ...]
+    needs: tuple[str, ...] = ()
+
+    def identities(self, asked: Sequence[str], background: Color = (1.0, 1.0, 1.0)) -> tuple[str, ...]:
+        """The identity strings of its scores, in order."""
+        return tuple(
+            str(measure.identity(name, background))
+            for name in self.regions(asked)
+            for measure in self.measures
+            if measure.regions is None or name in measure.regions
+        )
+
+    def lacking(self) -> tuple[str, ...]:
+        """Why metrics of it cannot be computed on this machine; scores that were made then are worth making again."""
+        return tuple(reason for measure in self.measures if (reason := measure.lacking()))
+
+    def absent(self, asked: Sequence[str], background: Color, reason: str) -> dict[str, Score]:
+        """The scores of a frame that was not there."""
+        return {i: Score.missing(i, reason) for i in self.identities(asked, background)}
+
+    def regions(self, asked: Sequence[str]) -> tuple[str, ...]:
+        """The regions that the preset takes numbers over when a protocol asks for some."""
+        names = [
+            name for measure in self.measures for name in (asked if measure.regions is None else measure.regions)
+        ]
+        return tuple(dict.fromkeys(names))
 
 
 def evaluate(
-    pred: NDArray,  # [H, W, 3] float in [0, 1] or uint8, on the protocol's background
-    truth: NDArray,  # as pred
+    pred: Any,  # [H, W, 3] or [H, W], float in [0, 1] or uint8, on the protocol's background
+    truth: Any,  # as pred
     regions: Mapping[str, Region] | None = None,
-    preset: str = "ihbench",
+    preset: str | Preset = "ihbench",
     background: Color = (1.0, 1.0, 1.0),
+    slow: bool = True,
+    over: Sequence[str] | None = None,
 ) -> dict[str, Score]:
     """Score one frame: identity string -> score, for every region and every metric of the preset.
 
     A region is a bool mask [H, W], None for the whole frame, or a string: the reason why it does not exist here,
-    which becomes the reason of its scores. No regions means the whole frame, `full`. `background` is what the images
-    were composited on and what is painted outside a region. Raises `ValueError` for shapes and dtypes that do not
-    match, `BadInput` for an unknown preset.
+    which becomes the reason of its scores. No regions means the whole frame, `full`. Numbers are taken over all of
+    them, or over those named in `over`, the others serving as crops. A preset that has regions of its own (the
+    released evaluators do) takes those, and a region it needs that is not given is a reason too.
+    `background` is what the images were composited on and what is painted outside a region. `slow=False` leaves out
+    the metrics that take a network. Raises `ValueError` for shapes and dtypes that do not match and for images of
+    four channels, `BadInput` for an unknown preset.
     """
-    chosen = find_preset(preset)
-    frame = Frame(*chosen.prepare(pred, truth), background)
-    check_images(frame.pred, frame.truth)
-    scores = {}
-    for name, region in ({"full": None} if regions is None else regions).items():
-        if isinstance(region, np.ndarray):
-            check_images(frame.pred, frame.truth, region)
-            covered = int(np.count_nonzero(region))
-            region = "empty region in this view" if covered == 0 else None if covered == region.size else region
-        for measure in chosen.measures:
-            identity = str(measure.identity(name, frame.background))
-            outcome = region if isinstance(region, str) else measure.compute(frame, region)
-            scores[identity] = _score(outcome, identity)
+    chosen = preset if isinstance(preset, Preset) else find_preset(preset)
+    pred, truth = _color_image(pred, "pred"), _color_image(truth, "truth")
+    if pred.shape != truth.shape:
+        raise ValueError(f"images: expected two of the same shape, got pred {pred.shape}, truth {truth.shape}")
+    given = {name: _checked_region(region, pred.shape) for name, region in (regions or {"full": None}).items()}
+    given.setdefault("full", None)
+    asked = tuple(over if over is not None else regions or ("full",))
+    prepared = chosen.prepare(pred, truth, given, background)
+    frame = None if isinstance(prepared, str) else Frame(*prepared, background, given)
+    if frame is not None:
+        check_images(frame.pred, frame.truth)
+    measures = [measure for measure in chosen.measures if slow or not measure.slow]
+    scores: dict[str, Score] = {}
+    known: list[tuple[Mask | None, dict[int, float | str]]] = []
+    for name in chosen.regions(asked):
+        region = given.get(name, f"region {name!r} was not given")
+        outcomes: dict[int, float | str] = {}
+        if frame is not None and not isinstance(region, str):
+            outcomes = _known_outcomes(region, known)
+        for k, measure in enumerate(measures):
+            if measure.regions is not None and name not in measure.regions:
+                continue
+            identity = str(measure.identity(name, background))
+            if frame is None:
+                scores[identity] = Score.missing(identity, str(prepared))
+            elif isinstance(region, str):
+                scores[identity] = Score.missing(identity, region)
+            else:
+                if k not in outcomes:
+                    outcomes[k] = measure.compute(frame, region)
+                scores[identity] = _score(outcomes[k], identity)
     return scores
 
 
 def find_preset(name: str) -> Preset:
-    """The preset of that name. Raises `BadInput` with the nearest names."""
-    if name not in PRESETS:
-        near = difflib.get_close_matches(name, PRESETS, cutoff=0.4) or sorted(PRESETS)
-        raise BadInput(f"metric preset {name!r}: not known; nearest: {', '.join(near)}")
-    return PRESETS[name]
+    """The registered preset of that name. Raises `BadInput` with the nearest names."""
+    found = registry.load("metric preset", name)
+    if not isinstance(found, Preset):
+        raise BadInput(f"metric preset {name!r}: registered object is no ihbench.metrics.evaluate.Preset")
+    return found
 
 
-def round_both_to_8bit(pred: NDArray, truth: NDArray) -> tuple[NDArray, NDArray]:
-    """Both images as they would be read back from PNG files; values outside [0, 1] are clipped.
+def _known_outcomes(region: Mask | None, known: list[tuple[Mask | None, dict[int, float | str]]]) -> dict:
+    """What was computed for an equal region of this frame; `visible` is often all of `body`."""
+    for mask, outcomes in known:
+        if mask is region or (mask is not None and region is not None and np.array_equal(mask, region)):
+            return outcomes
+    known.append((region, {}))
+    return known[-1][1]
 
-    A pixel that is not finite has no 8-bit value: then both images stay float and the pixel becomes NaN.
-    """
-    rounded = []
-    for image in (pred, truth):
-        if isinstance(image, np.ndarray) and np.issubdtype(image.dtype, np.floating):
-            image = np.rint(np.clip(np.where(np.isfinite(image), image, np.nan), 0, 1) * 255)
-        rounded.append(image)
-    if any(image.dtype != np.uint8 and np.isnan(image).any() for image in rounded):
-        return rounded[0].astype(np.float64) / 255, rounded[1].astype(np.float64) / 255
-    return rounded[0].astype(np.uint8), rounded[1].astype(np.uint8)
+
+def _color_image(image: Any, name: str) -> NDArray:
+    """[H, W, 3]; grey images get three equal channels."""
+    image = as_image(image, name)
+    if image.ndim == 3 and image.shape[2] == 1:
+        image = image[..., 0]
+    if image.ndim == 2:
+        return np.repeat(image[..., None], 3, axis=2)
+    if image.ndim != 3 or image.shape[2] != 3:
+        hint = "; composite RGBA on the background first" if image.ndim == 3 and image.shape[2] == 4 else ""
+        raise ValueError(f"{name}: expected an image [H, W, 3] or [H, W], got {image.shape}{hint}")
+    return image
+
+
+def _checked_region(region: Any, shape: tuple[int, ...]) -> Region:
+    """The region as a mask with both states, None for a mask of everything, a reason for one of nothing."""
+    if region is None or isinstance(region, str):
+        return region
+    mask = as_mask(region)
+    if not isinstance(mask, np.ndarray) or mask.shape != shape[:2] or mask.dtype != np.bool_:
+        got = f"{mask.dtype} {mask.shape}" if isinstance(mask, np.ndarray) else type(mask).__name__
+        raise ValueError(f"mask: expected bool {shape[:2]} like the images, got {got}")
+    covered = int(np.count_nonzero(mask))
+    return "empty region in this view" if covered == 0 else None if covered == mask.size else mask
 
 
 def _score(outcome: float | str, identity: str) -> Score:
@@ -118,33 +195,3 @@ def _score(outcome: float | str, identity: str) -> Score:
     if math.isnan(outcome):
         return Score.missing(identity, "NaN or infinite pixel in the region")
     return Score(outcome, identity)
-
-
-def _psnr(frame: Frame, mask: NDArray[np.bool_] | None) -> float:
-    return pooled_psnr(frame.squared_error, mask, frame.pred.shape, peak_of(frame.pred.dtype))
-
-
-def _ssim(frame: Frame, mask: NDArray[np.bool_] | None) -> float:
-    return mean_ssim(frame.pred, frame.truth, frame.differs, mask, background=frame.background)
-
-
-def _psnr_identity(region: str, background: Color) -> Identity:
-    return Identity("psnr", "pooled", "range1", region, version=1)
-
-
-def _ssim_identity(region: str, background: Color) -> Identity:
-    painted = "" if region == "full" else background_part(background)
-    return Identity("ssim", "gauss11-1.5", "range1", region, version=1, background=painted)
-
-
-PRESETS = {
-    preset.name: preset
-    for preset in [
-        Preset(
-            name="ihbench",
-            about="8-bit images; PSNR pooled over pixels and channels; Gaussian SSIM, regions painted first",
-            prepare=round_both_to_8bit,
-            measures=(Measure(_psnr_identity, _psnr), Measure(_ssim_identity, _ssim)),
-        ),
-    ]
-}

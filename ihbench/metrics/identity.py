@@ -12,6 +12,35 @@ import math
 import re
 from dataclasses import dataclass
 
+
+@dataclass(frozen=True)
+class Metric:
+    """How a metric is shown; what is stored is never scaled."""
+
+    title: str
+    higher_is_better: bool
+    decimals: int
+    scale: float = 1.0  # a table shows the value times this
+    unit: str = ""
+
+    @property
+    def arrow(self) -> str:
+        return "↑" if self.higher_is_better else "↓"
+
+    def text(self, value: float) -> str:
+        """A value as a table shows it: "—" when absent, "∞" without any error."""
+        if math.isnan(value):
+            return "—"
+        return "∞" if math.isinf(value) else f"{value * self.scale:.{self.decimals}f}"
+
+
+METRICS = {
+    "psnr": Metric("PSNR", True, 2, unit="dB"),
+    "ssim": Metric("SSIM", True, 4),
+    "lpips": Metric("LPIPS*", False, 1, 1000.0, "× 1000"),
+    "flip": Metric("FLIP", False, 4),
+}
+
 PART = re.compile(r"[A-Za-z0-9_.,+\[\]-]+")
 
 
@@ -64,6 +93,12 @@ class Score:
     @classmethod
     def missing(cls, identity: str, reason: str) -> Score:
         return cls(math.nan, identity, reason)
+
+
+def metric_of(identity: str) -> Metric:
+    """How the metric of an identity string is shown; one that a third party added has its own name and 4 decimals."""
+    name = identity.partition("/")[0]
+    return METRICS.get(name, Metric(name, True, 4))
 
 
 def background_part(background: tuple[float, float, float]) -> str:

@@ -7,6 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+EDGES = {"mirror": "symmetric", "reflect": "reflect", "zero": "constant"}  # what numpy calls them
+
 
 def psnr_oracle(pred: NDArray, truth: NDArray, mask: NDArray[np.bool_] | None = None) -> float:
     """PSNR in dB of [H, W, C] images, float with peak 1 or uint8; exactly rounded sums."""
@@ -21,59 +23,83 @@ def psnr_oracle(pred: NDArray, truth: NDArray, mask: NDArray[np.bool_] | None = 
     return math.inf if mse == 0 else -10 * math.log10(mse)
 
 
+def psnr_channels_oracle(pred: NDArray, truth: NDArray, mask: NDArray[np.bool_] | None = None) -> float:
+    """The mean of the channels' PSNRs in dB."""
+    values = [psnr_oracle(pred[..., c : c + 1], truth[..., c : c + 1], mask) for c in range(pred.shape[2])]
+    return math.fsum(values) / len(values) if all(map(math.isfinite, values)) else sum(values)
+
+
 def ssim_oracle(
     pred: NDArray,  # [H, W, C]
     truth: NDArray,  # [H, W, C]
     mask: NDArray[np.bool_] | None = None,  # [H, W]
     *,
     window: int = 11,
-    sigma: float = 1.5,
+    sigma: float | None = 1.5,
     data_range: float = 1.0,
-    background: float | tuple[float, ...] = 1.0,
+    border: str = "mirror",
+    crop: int = 0,
+    sample: bool = False,
+    background: float | tuple[float, ...] | None = 1.0,
 ) -> float:
-    """Mean of the SSIM map over the frame, or over the mask after painting both images outside it."""
+    """Mean of the SSIM map over the frame without `crop` pixels at its edges, or over the mask within it, after
+    painting both images outside the mask (not for `background=None`)."""
     pred, truth = _unit(pred), _unit(truth)
-    if mask is not None:
+    if mask is not None and background is not None:
         pred, truth = pred.copy(), truth.copy()
         pred[~mask] = truth[~mask] = background
-    values = ssim_map_oracle(pred, truth, window=window, sigma=sigma, data_range=data_range)
-    inside = values.ravel() if mask is None else values[mask].ravel()
-    return math.fsum(inside) / len(inside) if len(inside) else math.nan
+    values = ssim_map_oracle(
+        pred, truth, window=window, sigma=sigma, data_range=data_range, border=border, sample=sample
+    )
+    height, width = values.shape[:2]
+    inside = [
+        value
+        for i in range(crop, height - crop)
+        for j in range(crop, width - crop)
+        if mask is None or mask[i, j]
+        for value in values[i, j]
+    ]
+    return math.fsum(inside) / len(inside) if inside else math.nan
 
 
 def ssim_map_oracle(
-    pred: NDArray, truth: NDArray, *, window: int = 11, sigma: float = 1.5, data_range: float = 1.0
+    pred: NDArray,
+    truth: NDArray,
+    *,
+    window: int = 11,
+    sigma: float | None = 1.5,
+    data_range: float = 1.0,
+    border: str = "mirror",
+    sample: bool = False,
 ) -> NDArray[np.float64]:
-    """[H, W, C] SSIM (Wang et al. 2004, eq. 13) with a Gaussian window, population moments, mirrored edges."""
+    """[H, W, C] SSIM (Wang et al. 2004, eq. 13) with a Gaussian window, or equal weights for no sigma.
+
+    Population moments, or those times n/(n-1). Edges: "mirror" d c b a | a b c d, "reflect" d c b | a b c d, "zero".
+    """
     pred, truth = _unit(pred), _unit(truth)
     height, width, channels = pred.shape
     radius = window // 2
-    weights = np.array(
-        [
-            [math.exp(-(dy * dy + dx * dx) / (2 * sigma * sigma)) for dx in range(-radius, radius + 1)]
-            for dy in range(-radius, radius + 1)
-        ]
-    )
+    offsets = range(-radius, radius + 1)
+    weights = np.array([[1.0 if sigma is None else _gauss(dy, dx, sigma) for dx in offsets] for dy in offsets])
     weights /= math.fsum(weights.flat)
+    unbias = window**2 / (window**2 - 1) if sample else 1.0
     c1, c2 = (0.01 * data_range) ** 2, (0.03 * data_range) ** 2
     out = np.empty(pred.shape)
+    around = ((radius, radius), (radius, radius), (0, 0))
+    padded = [np.pad(image, around, EDGES[border]) for image in (pred, truth)]  # type: ignore[call-overload]
     for i, j, c in np.ndindex(height, width, channels):
-        rows = [_mirror(i + d, height) for d in range(-radius, radius + 1)]
-        columns = [_mirror(j + d, width) for d in range(-radius, radius + 1)]
-        x, y = pred[np.ix_(rows, columns, [c])][..., 0], truth[np.ix_(rows, columns, [c])][..., 0]
+        x, y = (image[i : i + window, j : j + window, c] for image in padded)
         mean_x, mean_y = math.fsum((weights * x).flat), math.fsum((weights * y).flat)
-        var_x = math.fsum((weights * (x - mean_x) ** 2).flat)
-        var_y = math.fsum((weights * (y - mean_y) ** 2).flat)
-        covariance = math.fsum((weights * (x - mean_x) * (y - mean_y)).flat)
+        var_x = unbias * math.fsum((weights * (x - mean_x) ** 2).flat)
+        var_y = unbias * math.fsum((weights * (y - mean_y) ** 2).flat)
+        covariance = unbias * math.fsum((weights * (x - mean_x) * (y - mean_y)).flat)
         luminance = (2 * mean_x * mean_y + c1) / (mean_x**2 + mean_y**2 + c1)
         out[i, j, c] = luminance * (2 * covariance + c2) / (var_x + var_y + c2)
     return out
 
 
-def _mirror(index: int, length: int) -> int:
-    """The pixel an index outside [0, length) falls on when the image is mirrored at its edges: d c b a | a b c d."""
-    index %= 2 * length
-    return index if index < length else 2 * length - 1 - index
+def _gauss(dy: int, dx: int, sigma: float) -> float:
+    return math.exp(-(dy * dy + dx * dx) / (2 * sigma * sigma))
 
 
 def _unit(image: NDArray) -> NDArray[np.float64]:

@@ -3,79 +3,105 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ihbench.metrics.images import Mask, bounds, checked, differing_pixels, peak_of
+
+BAND = 2**18  # pixels worked on at a time
+
 
 def psnr(
-    pred: NDArray,  # [H, W, C] or [H, W], float in [0, 1] or uint8
-    truth: NDArray,  # as pred
-    mask: NDArray[np.bool_] | None = None,  # [H, W]; None is the whole frame
+    pred: Any,  # [H, W, C] or [H, W], float in [0, 1] or uint8
+    truth: Any,  # as pred
+    mask: Any = None,  # [H, W] bool; None is the whole frame
 ) -> float:
     """PSNR in dB for a peak of 1 (255 for uint8): -10 log10 of the mean squared error over the mask and all channels.
 
     Averaging the three channels' PSNRs instead, as some released code does, is never smaller (Jensen) and is a
-    different number. Identical images give inf, an empty mask NaN, a NaN or infinite pixel inside the mask NaN.
-    Pixels outside the mask never count. Raises `ValueError` when shapes or dtypes do not match.
+    different number: `mean_of_channels`. Identical images give inf, an empty mask NaN, a NaN or infinite pixel inside
+    the mask NaN. Pixels outside the mask never count. Raises `ValueError` when shapes or dtypes do not match.
     """
-    check_images(pred, truth, mask)
-    return pooled_psnr(squared_error(pred, truth), mask, pred.shape, peak=peak_of(pred.dtype))
+    pred, truth, mask = checked(pred, truth, mask)
+    return SquaredError.of(pred, truth, differing_pixels(pred, truth)).pooled(mask)
 
 
-def pooled_psnr(
-    error: NDArray,  # [H, W] from `squared_error`; shared by all regions of a frame
-    mask: NDArray[np.bool_] | None,  # [H, W]
-    shape: tuple[int, ...],  # of the images
-    peak: float,
-) -> float:
-    """`psnr` from the squared error of images already checked."""
-    pixels = error.size if mask is None else int(np.count_nonzero(mask))
-    count = pixels * math.prod(shape[2:])
-    if count == 0:
-        return math.nan
-    total = float(error.sum() if mask is None else error.sum(where=mask))
-    if not math.isfinite(total):
-        return math.nan
-    return -10.0 * math.log10(total / count / peak**2) if total > 0 else math.inf
+def mean_of_channels(pred: Any, truth: Any, mask: Any = None) -> float:
+    """The mean of the channels' own PSNRs, the habit of code descended from 3D Gaussian splatting.
 
-
-def squared_error(pred: NDArray, truth: NDArray) -> NDArray:
-    """[H, W] squared difference summed over the channels: exact integers for uint8, else float64.
-
-    Not divided by the peak, so that sums over 8-bit images are exact in any order.
+    One channel without any error makes it inf. Otherwise as `psnr`.
     """
-    with np.errstate(invalid="ignore", over="ignore"):  # a NaN or infinite pixel becomes a NaN score, not a warning
-        if pred.dtype == np.uint8:
-            difference = np.subtract(pred, truth, dtype=np.int32)
+    pred, truth, mask = checked(pred, truth, mask)
+    return SquaredError.of(pred, truth, differing_pixels(pred, truth)).mean_of_channels(mask)
+
+
+@dataclass(frozen=True)
+class SquaredError:
+    """Squared differences of two images, shared by all regions of a frame.
+
+    They are kept for the rectangle in which the images differ, and not divided by the peak, so that 8-bit images
+    have integers there and any order of summation gives the same sum.
+    """
+
+    values: NDArray[np.float64]  # [C, h, w] inside the rectangle
+    rows: slice
+    columns: slice
+    pixels: int  # of the frame
+    peak: float
+
+    @classmethod
+    def of(cls, pred: NDArray, truth: NDArray, differs: Mask) -> SquaredError:
+        """From images already checked and `differing_pixels` of them."""
+        rows, columns = bounds(differs) or (slice(0, 0), slice(0, 0))
+        channels = pred.shape[2] if pred.ndim == 3 else 1
+        x, y = (image.reshape(*image.shape[:2], channels)[rows, columns] for image in (pred, truth))
+        values = np.empty((channels, *x.shape[:2]))
+        step = max(1, BAND // max(1, x.shape[1]))
+        with np.errstate(invalid="ignore", over="ignore"):  # a NaN or infinite pixel becomes a NaN score, no warning
+            for top in range(0, len(x), step):
+                band = slice(top, top + step)
+                for channel in range(channels):
+                    out = values[channel, band]
+                    np.subtract(x[band, :, channel], y[band, :, channel], out=out, dtype=np.float64)
+                    np.multiply(out, out, out=out)
+        return cls(values, rows, columns, differs.size, peak_of(pred.dtype))
+
+    def means(self, mask: Mask | None) -> list[float]:
+        """The mean squared error of every channel over the mask, for a peak of 1; NaN where there is none."""
+        pixels = self.pixels if mask is None else int(np.count_nonzero(mask))
+        if pixels == 0:
+            return [math.nan] * len(self.values)
+        if mask is None:
+            totals = [float(plane.sum()) for plane in self.values]
         else:
-            difference = np.subtract(pred, truth, dtype=np.float64)
-        difference *= difference
-        if difference.ndim == 2:
-            return difference.astype(np.int64) if pred.dtype == np.uint8 else difference
-        out = np.zeros(difference.shape[:2], np.int64 if pred.dtype == np.uint8 else np.float64)
-        for channel in range(difference.shape[2]):  # faster than sum(axis=-1) over an axis of three
-            out += difference[..., channel]
-        return out
+            inside = mask[self.rows, self.columns]
+            weights = inside.ravel().astype(np.float64)
+            # a product is much faster than a selection, but outside pixels that are not finite would spoil it
+            with np.errstate(invalid="ignore"):
+                totals = [float(plane.ravel() @ weights) for plane in self.values]
+            totals = [
+                total if math.isfinite(total) else float(np.where(inside, plane, 0).ravel() @ weights)
+                for total, plane in zip(totals, self.values, strict=True)
+            ]
+        means = [total / pixels / self.peak**2 for total in totals]
+        return [mean if math.isfinite(mean) else math.nan for mean in means]
+
+    def pooled(self, mask: Mask | None) -> float:
+        """PSNR of the mean over all channels."""
+        means = self.means(mask)
+        return decibels(math.fsum(means) / len(means)) if means else math.nan
+
+    def mean_of_channels(self, mask: Mask | None) -> float:
+        """The mean of the channels' PSNRs."""
+        values = [decibels(mean) for mean in self.means(mask)]
+        return sum(values) / len(values) if values else math.nan
 
 
-def peak_of(dtype: np.dtype) -> float:
-    """The largest value of an image of this dtype: 255 for uint8, 1 for floats."""
-    return 255.0 if dtype == np.uint8 else 1.0
-
-
-def check_images(pred: NDArray, truth: NDArray, mask: NDArray | None = None) -> None:
-    """Raise `ValueError`, naming both sides, unless two images and a mask can be compared."""
-    for name, image in (("pred", pred), ("truth", truth)):
-        if not isinstance(image, np.ndarray):
-            raise ValueError(f"{name}: expected a numpy array, got {type(image).__name__}")
-        if image.dtype != np.uint8 and not np.issubdtype(image.dtype, np.floating):
-            raise ValueError(f"{name}: expected uint8, or floats in [0, 1], got {image.dtype}")
-    if pred.shape != truth.shape or pred.ndim not in (2, 3):
-        raise ValueError(
-            f"images: expected two of the same shape [H, W] or [H, W, C], got pred {pred.shape}, truth {truth.shape}"
-        )
-    if (pred.dtype == np.uint8) != (truth.dtype == np.uint8):
-        raise ValueError(f"images: expected both uint8 or both float, got pred {pred.dtype}, truth {truth.dtype}")
-    if mask is not None and (mask.shape != pred.shape[:2] or mask.dtype != np.bool_):
-        raise ValueError(f"mask: expected bool {pred.shape[:2]} like the images, got {mask.dtype} {mask.shape}")
+def decibels(mse: float) -> float:
+    """-10 log10 of a mean squared error for a peak of 1; inf for 0, NaN for NaN."""
+    if math.isnan(mse):
+        return math.nan
+    return -10.0 * math.log10(mse) if mse > 0 else math.inf

@@ -1,8 +1,9 @@
-"""Structural similarity (Wang et al., IEEE TIP 2004) with a Gaussian window.
+"""Structural similarity (Wang et al., IEEE TIP 2004).
 
-The definition, all of it: weights exp(-r²/2σ²) on an 11×11 square with σ = 1.5, normalised to 1; K1 = 0.01,
+The headline definition, all of it: weights exp(-r²/2σ²) on an 11×11 square with σ = 1.5, normalised to 1; K1 = 0.01,
 K2 = 0.03; population moments (the weights sum to 1, no n/(n-1) correction); every channel by itself; images mirrored
-at their edges (d c b a | a b c d, scipy's "reflect"); the mean runs over the whole map, no border is cropped.
+at their edges (d c b a | a b c d, scipy's "reflect"); the mean runs over the whole map, no border is cropped. Every
+one of these is a field of `Window`, so that the released evaluators' readings are one line each.
 
 How it is computed. With s = x + y and d = x - y every term follows from four filtered images, E[s], E[d], E[s²] and
 E[d²]:
@@ -18,205 +19,252 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
+from threading import local
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench.metrics.psnr import check_images
+from ihbench.metrics.images import Mask, checked, differing_pixels, peak_of
 
 K1, K2 = 0.01, 0.03
-BAND = 64  # rows worked on at a time: the float64 temporaries of a band stay in the cache
+BAND = 2**16  # about so many pixels are worked on at a time: their float64 sums and differences take 1.5 MB
+
+Border = Literal["mirror", "reflect", "zero"]
+
+
+@dataclass(frozen=True)
+class Window:
+    """Everything that defines an SSIM. Raises `ValueError` for a window without a centre or a width."""
+
+    size: int = 11  # px, odd
+    sigma: float | None = 1.5  # px; None for equal weights
+    data_range: float = 1.0  # of the images; 2 is what old scikit-image assumed of any float image
+    border: Border = "mirror"  # d c b a | a b c d, d c b | a b c d (torch's "reflect"), 0 0 0 | a b c d
+    crop: int = 0  # px at the frame's edges that do not count
+    sample: bool = False  # moments times n/(n-1), scikit-image's default
+
+    def __post_init__(self) -> None:
+        if self.size < 1 or self.size % 2 == 0 or (self.sigma is not None and not self.sigma > 0):
+            raise ValueError(
+                f"ssim window: expected an odd size and sigma > 0, got window={self.size}, sigma={self.sigma}"
+            )
+        if self.crop < 0 or (self.sample and self.size == 1):
+            raise ValueError(f"ssim window: crop below 0 or sample moments of one pixel: {self}")
+
+    @property
+    def weights(self) -> NDArray[np.float64]:
+        """[size] weights along one axis, summing to 1."""
+        return np.full(self.size, 1 / self.size) if self.sigma is None else gaussian_window(self.size, self.sigma)
+
+    @property
+    def unbias(self) -> float:
+        """What variances and the covariance are multiplied by."""
+        return self.size**2 / (self.size**2 - 1) if self.sample else 1.0
+
+
+HEADLINE = Window()
 
 
 def ssim(
-    pred: NDArray,  # [H, W, C] or [H, W], float in [0, data_range] or uint8
-    truth: NDArray,  # as pred
-    mask: NDArray[np.bool_] | None = None,  # [H, W]; None is the whole frame
+    pred: Any,  # [H, W, C] or [H, W], float in [0, data_range] or uint8
+    truth: Any,  # as pred
+    mask: Any = None,  # [H, W] bool; None is the whole frame
     *,
     window: int = 11,
-    sigma: float = 1.5,
+    sigma: float | None = 1.5,
     data_range: float = 1.0,
-    background: float | tuple[float, ...] = 1.0,
+    border: Border = "mirror",
+    crop: int = 0,
+    sample: bool = False,
+    background: float | tuple[float, ...] | None = 1.0,
 ) -> float:
     """Mean SSIM over the frame, or over a region.
 
     For a region both images are first painted with `background` (a value, or one per channel, in the units of
     `data_range`) outside the mask, then the map is averaged over the mask: nothing outside can leak in through the
-    windows. uint8 images are divided by 255. An empty mask gives NaN, a NaN or infinite pixel inside the mask NaN.
-    Raises `ValueError` for shapes or dtypes that do not match and for an even window.
+    windows. `background=None` does not paint, as OccNeRF's evaluator does not; then windows at the mask's border see
+    what lies outside. The other switches are the fields of `Window`. uint8 images are divided by 255. An empty mask
+    gives NaN, a NaN or infinite pixel inside the mask NaN, a frame without pixels beyond `crop` NaN. Raises
+    `ValueError` for shapes or dtypes that do not match and for an even window.
     """
-    check_images(pred, truth, mask)
-    check_window(window, sigma)
-    differs = differing_pixels(pred, truth)
-    return mean_ssim(pred, truth, differs, mask, window, sigma, data_range, background)
+    pred, truth, mask = checked(pred, truth, mask)
+    definition = Window(window, sigma, data_range, border, crop, sample)
+    return mean_ssim(pred, truth, differing_pixels(pred, truth), mask, definition, background)
 
 
 def mean_ssim(
     pred: NDArray,
     truth: NDArray,
-    differs: NDArray[np.bool_],  # [H, W] from `differing_pixels`; shared by all regions of a frame
-    mask: NDArray[np.bool_] | None,
-    window: int = 11,
-    sigma: float = 1.5,
-    data_range: float = 1.0,
-    background: float | tuple[float, ...] = 1.0,
+    differs: Mask,  # [H, W] from `differing_pixels`; shared by all regions of a frame
+    mask: Mask | None,
+    window: Window = HEADLINE,
+    background: float | tuple[float, ...] | None = 1.0,
 ) -> float:
     """`ssim` for images already checked."""
     channels = pred.shape[2] if pred.ndim == 3 else 1
-    pixels = differs.size if mask is None else int(np.count_nonzero(mask))
+    counted = _within_crop(mask, differs.shape, window.crop)
+    pixels = differs.size if counted is None else int(np.count_nonzero(counted))
     if pixels * channels == 0:
         return math.nan
-    if mask is not None:
-        differs = differs & mask
+    painted = mask if background is not None else None
     deficit = 0.0  # the sum of 1 - SSIM: values near 1 keep their digits
-    for rows, columns, outer_rows, outer_columns in _windows_to_do(differs, mask, window // 2):
-        inside = None if mask is None else mask[outer_rows, outer_columns]
-        x, y = pred[outer_rows, outer_columns], truth[outer_rows, outer_columns]
-        values = _ssim_of(x, y, inside, window, sigma, data_range, background)
-        weights = np.zeros(values.shape[:2])  # selecting pixels by a product is ten times faster than by index
-        within = _within(rows, outer_rows), _within(columns, outer_columns)
-        weights[within] = 1.0 if inside is None else inside[within]
-        deficit += channels * weights.sum() - (weights.ravel() @ values.reshape(weights.size, channels)).sum()
+    for band in _bands(differs if painted is None else differs & painted, counted, window.size // 2):
+        deficit += _deficit_of(pred, truth, band, counted, painted, window, background)
     return float(1.0 - deficit / (pixels * channels)) if math.isfinite(deficit) else math.nan
 
 
 def ssim_map(
-    pred: NDArray,  # [H, W, C] or [H, W], float in [0, data_range] or uint8
-    truth: NDArray,  # as pred
+    pred: Any,  # [H, W, C] or [H, W], float in [0, data_range] or uint8
+    truth: Any,  # as pred
     *,
-    window: int = 11,
-    sigma: float = 1.5,
-    data_range: float = 1.0,
+    window: Window = HEADLINE,
 ) -> NDArray[np.float64]:
     """SSIM at every pixel and channel, with the images' shape. Raises `ValueError` as `ssim` does."""
-    check_images(pred, truth)
-    check_window(window, sigma)
+    pred, truth, _ = checked(pred, truth)
     out = np.ones(pred.shape)
-    for rows, columns, outer_rows, outer_columns in _windows_to_do(differing_pixels(pred, truth), None, window // 2):
-        x, y = pred[outer_rows, outer_columns], truth[outer_rows, outer_columns]
-        values = _ssim_of(x, y, None, window, sigma, data_range, 0.0)
-        out[rows, columns] = values[_within(rows, outer_rows), _within(columns, outer_columns)]
+    for band in _bands(differing_pixels(pred, truth), None, window.size // 2):
+        _deficit_of(pred, truth, band, None, None, window, None, out)
     return out
 
 
-def gaussian_window(window: int, sigma: float) -> NDArray[np.float64]:
-    """[window] weights of the separable Gaussian, summing to 1."""
-    offset = np.arange(window) - window // 2
+def gaussian_window(size: int, sigma: float) -> NDArray[np.float64]:
+    """[size] weights of the separable Gaussian, summing to 1."""
+    offset = np.arange(size) - size // 2
     weights = np.exp(-0.5 * (offset / sigma) ** 2)
     return weights / weights.sum()
 
 
-def check_window(window: int, sigma: float) -> None:
-    """Raise `ValueError` unless the window has a centre and a width."""
-    if window < 1 or window % 2 == 0 or not sigma > 0:
-        raise ValueError(f"ssim window: expected an odd size and sigma > 0, got window={window}, sigma={sigma}")
+@dataclass(frozen=True)
+class _Band:
+    """Some rows of the image, and the columns of each that need work."""
+
+    top: int
+    first: NDArray[np.int64]  # [m]
+    last: NDArray[np.int64]  # [m], not included; at or below `first` where the row needs none
+
+    @property
+    def rows(self) -> slice:
+        return slice(self.top, self.top + len(self.first))
 
 
-def _ssim_of(
+def _bands(differs: Mask, counted: Mask | None, radius: int) -> Iterator[_Band]:
+    """Every counted pixel with a differing pixel in its window, as spans of rows."""
+    first, last = _row_extents(differs)
+    width = differs.shape[1]
+    around = np.lib.stride_tricks.sliding_window_view
+    first = around(np.pad(first, radius, constant_values=width), 2 * radius + 1).min(1)
+    last = around(np.pad(last, radius), 2 * radius + 1).max(1)
+    empty = first >= last
+    first, last = np.maximum(first - radius, 0), np.minimum(last + radius, width)
+    if counted is not None:
+        inner_first, inner_last = _row_extents(counted)
+        first, last = np.maximum(first, inner_first), np.minimum(last, inner_last)
+    last = np.where(empty, 0, last)
+    work = np.flatnonzero(first < last)
+    if len(work):
+        step = max(4 * radius + 1, BAND // int((last - first)[work].max()))
+        for top in range(work[0], work[-1] + 1, step):
+            rows = slice(top, min(top + step, work[-1] + 1))
+            if (first[rows] < last[rows]).any():
+                yield _Band(top, first[rows], last[rows])
+
+
+def _row_extents(mask: Mask) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First and one past the last True column of every row [H]; an empty row has first = W, last = 0."""
+    width = mask.shape[1]
+    if width == 0:
+        return np.zeros(len(mask), np.int64), np.zeros(len(mask), np.int64)
+    first, last = mask.argmax(1), width - mask[:, ::-1].argmax(1)
+    empty = ~mask[np.arange(len(mask)), first]
+    return np.where(empty, width, first), np.where(empty, 0, last)
+
+
+def _deficit_of(
+    pred: NDArray,
+    truth: NDArray,
+    band: _Band,
+    counted: Mask | None,
+    painted: Mask | None,
+    window: Window,
+    background: float | tuple[float, ...] | None,
+    values: NDArray[np.float64] | None = None,
+) -> float:
+    """The sum of 1 - SSIM over a band's counted pixels; SSIM itself into `values` where one is given."""
+    from ihbench.metrics import ssim_kernel as kernel
+
+    (height, width), radius = pred.shape[:2], window.size // 2
+    wanted = band.first < band.last
+    left, right = int(band.first[wanted].min()), int(band.last[wanted].max())
+    # rows and columns that the windows reach; where the image ends earlier the border rule takes over
+    outer = (
+        slice(max(band.rows.start - radius, 0), min(band.rows.stop + radius, height)),
+        slice(max(left - radius, 0), min(right + radius, width)),
+    )
+    s, d = _sum_and_difference(pred[outer], truth[outer], None if painted is None else painted[outer], background)
+    channels = s.shape[2]
+    counts = np.ones((len(wanted), s.shape[1]), np.bool_)
+    if counted is not None:
+        counts = np.ascontiguousarray(counted[band.rows, outer[1]])
+    keep = np.empty((len(wanted), s.shape[1] * channels) if values is not None else (0, 0))
+    weights = np.zeros(-(-window.size // kernel.GROUP) * kernel.GROUP)
+    weights[: window.size] = window.weights
+    scale = (window.data_range * peak_of(pred.dtype)) ** 2
+    border = {"mirror": kernel.MIRROR, "reflect": kernel.REFLECT, "zero": kernel.ZERO}[window.border]
+    deficit = kernel.ssim_rows(
+        s.reshape(len(s), -1), d.reshape(len(d), -1), channels, weights, window.size, border, window.unbias,
+        2 * K1**2 * scale, 2 * K2**2 * scale, band.top - outer[0].start, band.first - outer[1].start,
+        band.last - outer[1].start, counts, values is not None, keep,
+    )  # fmt: skip
+    if values is not None:
+        kept = keep.reshape(len(wanted), -1, channels)
+        for i in np.flatnonzero(wanted):
+            columns = slice(band.first[i], band.last[i])
+            row = kept[i, columns.start - outer[1].start : columns.stop - outer[1].start]
+            values[band.top + i, columns] = row.reshape(values[band.top + i, columns].shape)
+    return deficit
+
+
+def _sum_and_difference(
     pred: NDArray,  # [h, w, C] or [h, w]
     truth: NDArray,
-    inside: NDArray[np.bool_] | None,  # [h, w]
-    window: int,
-    sigma: float,
-    data_range: float,
-    background: float | tuple[float, ...],
-) -> NDArray[np.float64]:
-    """The SSIM map of two images, painted outside `inside` and mirrored at their edges."""
-    import cv2
+    inside: Mask | None,  # [h, w]
+    background: float | tuple[float, ...] | None,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """x + y and x - y, [h, w, C], both images painted outside `inside`."""
+    from ihbench.metrics.ssim_kernel import sum_and_difference
 
-    peak = 255.0 if pred.dtype == np.uint8 else 1.0
-    shape = pred.shape
-    s, d = np.empty(shape), np.empty(shape)
-    with np.errstate(invalid="ignore", over="ignore"):  # a NaN or infinite pixel becomes NaN, not a warning
-        if pred.dtype == np.uint8:
-            pred, truth = pred.astype(np.int16), truth.astype(np.int16)
-            np.add(pred, truth, out=s)
-            np.subtract(pred, truth, out=d)
-        else:
-            np.add(pred, truth, out=s, dtype=np.float64)
-            np.subtract(pred, truth, out=d, dtype=np.float64)
-        if inside is not None:
-            outside = ~inside if s.ndim == 2 else np.repeat(~inside[..., None], shape[2], axis=2)
-            np.copyto(s, 2 * peak * np.asarray(background, np.float64), where=outside)
-            np.copyto(d, 0.0, where=outside)
-
-        weights = gaussian_window(window, sigma)
-
-        def filtered(image: NDArray) -> NDArray:
-            out = np.empty(shape)  # given, because cv2 would drop a channel axis of length 1
-            cv2.sepFilter2D(image, cv2.CV_64F, weights, weights, dst=out, borderType=cv2.BORDER_REFLECT)
-            return out
-
-        mean_s, mean_d = filtered(s), filtered(d)
-        s *= s
-        d *= d
-        var_s, var_d = filtered(s), filtered(d)
-        mean_s *= mean_s
-        mean_d *= mean_d
-        var_s -= mean_s
-        var_d -= mean_d
-        luminance = _ratio(mean_s, mean_d, 2 * (K1 * data_range * peak) ** 2, out=s)
-        contrast = _ratio(var_s, var_d, 2 * (K2 * data_range * peak) ** 2, out=d)
-        return np.multiply(luminance, contrast, out=s)
+    shape = pred.shape if pred.ndim == 3 else (*pred.shape, 1)
+    dtype = np.dtype(np.float32) if pred.dtype == np.float16 else pred.dtype
+    # own copies: the kernel would be compiled again for arrays that are read-only or not contiguous
+    x, y = _scratch("pred", shape, dtype), _scratch("truth", shape, dtype)
+    x[...], y[...] = pred.reshape(shape), truth.reshape(shape)
+    s, d = _scratch("s", shape, np.dtype(np.float64)), _scratch("d", shape, np.dtype(np.float64))
+    paint = np.full(shape[2], peak_of(pred.dtype)) * (0.0 if background is None else np.asarray(background))
+    painted = np.zeros((0, 0), np.bool_) if inside is None or background is None else np.array(inside, order="C")
+    sum_and_difference(x, y, painted, paint, s, d)
+    return s, d
 
 
-def _ratio(a: NDArray, b: NDArray, c: float, out: NDArray) -> NDArray:
-    """(a - b + c) / (a + b + c) into `out`, overwriting a."""
-    np.subtract(a, b, out=out)
-    out += c
-    a += b
-    a += c
-    return np.divide(out, a, out=out)
+_OWN = local()
 
 
-def differing_pixels(pred: NDArray, truth: NDArray) -> NDArray[np.bool_]:
-    """[H, W] True where the images differ in any channel, or hold something that is not finite."""
-    values = pred != truth
-    if pred.dtype != np.uint8:
-        values |= ~np.isfinite(pred)
-    if values.ndim == 2:
-        return values
-    out = np.zeros(values.shape[:2], np.bool_)
-    for channel in range(values.shape[2]):  # ten times faster than any(axis=-1) over an axis of three
-        out |= values[..., channel]
+def _scratch(name: str, shape: tuple[int, ...], dtype: np.dtype) -> NDArray:
+    """An array of this thread that is used again: fresh memory of this size costs more than what is done with it."""
+    size = math.prod(shape)
+    kept = getattr(_OWN, name, None)
+    if kept is None or len(kept) < size or kept.dtype != dtype:
+        kept = np.empty(size, dtype)
+        setattr(_OWN, name, kept)
+    return kept[:size].reshape(shape)
+
+
+def _within_crop(mask: Mask | None, shape: tuple[int, int], crop: int) -> Mask | None:
+    """The mask without a border of `crop` pixels."""
+    if crop == 0:
+        return mask
+    out = np.zeros(shape, np.bool_)
+    inner = slice(crop, max(shape[0] - crop, crop)), slice(crop, max(shape[1] - crop, crop))
+    out[inner] = True if mask is None else mask[inner]
     return out
-
-
-def _windows_to_do(
-    differs: NDArray[np.bool_],  # [H, W]
-    mask: NDArray[np.bool_] | None,  # [H, W]
-    radius: int,
-) -> Iterator[tuple[slice, slice, slice, slice]]:
-    """Rectangles that hold every pixel of the mask with a differing pixel in its window, as row bands.
-
-    Each comes as rows and columns, then the same grown by the window's radius as far as the image goes. A window that
-    is cut by the image's edge there is mirrored by the filter; everywhere else the grown rectangle holds all of it.
-    """
-    height, width = differs.shape
-    first, last = _extent(differs, mask, 1, radius)
-    for top in range(first, last, BAND):
-        bottom = min(top + BAND, last)
-        outer_rows = slice(max(top - radius, 0), min(bottom + radius, height))
-        left, right = _extent(differs[outer_rows], None if mask is None else mask[top:bottom], 0, radius)
-        if left < right:
-            outer_columns = slice(max(left - radius, 0), min(right + radius, width))
-            yield slice(top, bottom), slice(left, right), outer_rows, outer_columns
-
-
-def _extent(differs: NDArray[np.bool_], mask: NDArray[np.bool_] | None, axis: int, radius: int) -> tuple[int, int]:
-    """The range, across `axis`, of the mask within the radius of a differing pixel; (0, 0) if empty."""
-    where = np.flatnonzero(differs.any(axis))
-    if len(where) == 0:
-        return 0, 0
-    first, last = max(where[0] - radius, 0), min(where[-1] + radius + 1, differs.shape[1 - axis])
-    if mask is not None:
-        where = np.flatnonzero(mask.any(axis))
-        if len(where) == 0:
-            return 0, 0
-        first, last = max(first, where[0]), min(last, where[-1] + 1)
-    return int(first), int(last)
-
-
-def _within(inner: slice, outer: slice) -> slice:
-    """`inner` counted from the start of `outer`."""
-    return slice(inner.start - outer.start, inner.stop - outer.start)

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ihbench.metrics.ssim import K1, K2, check_window, gaussian_window
+from ihbench.metrics.ssim import K1, K2, Window
 
 
 def ssim_map_torch(
@@ -27,11 +27,11 @@ def ssim_map_torch(
         raise ValueError(
             f"images: expected two of the same shape [..., C, H, W], got {tuple(pred.shape)}, {tuple(truth.shape)}"
         )
-    check_window(window, sigma)
+    taps = Window(window, sigma).weights
     dtype = torch.promote_types(torch.promote_types(pred.dtype, truth.dtype), torch.float32)
     height, width = pred.shape[-2:]
     x, y = (image.to(dtype).reshape(-1, 1, height, width) for image in (pred, truth))
-    weights = torch.from_numpy(gaussian_window(window, sigma)).to(pred.device, dtype)
+    weights = torch.from_numpy(taps).to(pred.device, dtype)
     s, d = x + y - data_range, x - y
     mean_s, mean_d, square_s, square_d = _blurred(torch.cat([s, d, s * s, d * d], 1), weights).unbind(1)
     contrast = _ratio(square_s - mean_s**2, square_d - mean_d**2, 2 * (K2 * data_range) ** 2)

@@ -1,0 +1,49 @@
+"""Images as they would be read back from PNG files."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def rounded(image: NDArray) -> NDArray:
+    """The nearest 8-bit image; values outside [0, 1] are clipped.
+
+    A pixel that is not finite has no 8-bit value: then the image stays float, in steps of 1/255, and the pixel
+    becomes NaN. uint8 images are returned as they are.
+    """
+    return _to_8bit(image.astype(np.float32) if image.dtype == np.float16 else image, np.rint)
+
+
+def truncated(image: NDArray) -> NDArray:
+    """The 8-bit image that a cast makes, as HumanNeRF's `to_8b_image` does, in the image's own precision.
+
+    In float32 a few of the 256 values k/255 fall one below k: a quirk of the released code that this keeps.
+    Otherwise as `rounded`.
+    """
+    return _to_8bit(image, np.floor)
+
+
+def _to_8bit(image: NDArray, whole: np.ufunc) -> NDArray:
+    if image.dtype == np.uint8:
+        return image
+    scaled = np.clip(image, 0, 1)  # numpy keeps NaN
+    scaled *= 255
+    whole(scaled, out=scaled)
+    if not np.isfinite(image.sum(dtype=np.float64)):  # a sum is NaN or infinite if one pixel is, or none is (HDR)
+        bad = ~np.isfinite(image)
+        if bad.any():
+            return np.where(bad, np.nan, scaled).astype(np.float64) / 255
+    return scaled.astype(np.uint8)
+
+
+def same_type(pred: NDArray, truth: NDArray) -> tuple[NDArray, NDArray]:
+    """Two prepared images, both uint8 or both float with peak 1."""
+    if (pred.dtype == np.uint8) == (truth.dtype == np.uint8):
+        return pred, truth
+    return as_float(pred), as_float(truth)
+
+
+def as_float(image: NDArray) -> NDArray:
+    """The image with peak 1; uint8 becomes float64."""
+    return image / 255.0 if image.dtype == np.uint8 else image

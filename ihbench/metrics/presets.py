@@ -1,0 +1,352 @@
+"""The presets: our own, and each released evaluator as it computes.
+
+Facts about the released code, to the line, stand in each preset's `source`. What they share is written once; what a
+number is (8 bits or not, which pixels, which SSIM, what LPIPS was fed) stands in its identity string, which carries
+the evaluator's name so that no two are ever taken for one another. The background is the protocol's: an evaluator
+that was run on black gives its numbers under a protocol with a black background.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench.errors import BadInput
+from ihbench.metrics.eight_bit import as_float, rounded, same_type, truncated
+from ihbench.metrics.evaluate import Frame, Measure, Preset, Region
+from ihbench.metrics.identity import Identity, background_part
+from ihbench.metrics.images import Color, Mask, bounds
+from ihbench.metrics.psnr import psnr
+from ihbench.metrics.ssim import Window, mean_ssim, ssim
+
+SKIMAGE = Window(size=7, sigma=None, data_range=2.0, crop=3, sample=True)  # of float images, before version 0.20
+SKIMAGE_MAP = Window(size=7, sigma=None, data_range=2.0, sample=True)  # its map, to its edges
+SPLATTING = Window(border="zero")  # the lineage of 3D Gaussian splatting
+TORCHMETRICS_CROP = Window(border="reflect", crop=5)  # torchmetrics up to 1.4.1
+TORCHMETRICS = Window(border="reflect")  # since 1.4.2
+
+Compute = Callable[[Frame, Mask | None], float | str]
+
+
+# ----------------------------------------------------------------------------------------------------
+# Ours
+
+
+def _prepare_rounded(
+    pred: NDArray, truth: NDArray, regions: Mapping[str, Region], background: Color
+) -> tuple[NDArray, NDArray]:
+    return same_type(rounded(pred), rounded(truth))
+
+
+def _psnr(frame: Frame, mask: Mask | None) -> float:
+    return frame.squared_error.pooled(mask)
+
+
+def _ssim(frame: Frame, mask: Mask | None) -> float:
+    return mean_ssim(frame.pred, frame.truth, frame.differs, mask, background=frame.background)
+
+
+def _flip(frame: Frame, mask: Mask | None) -> float:
+    from ihbench.metrics.flip import mean_flip
+
+    return mean_flip(frame.pred, frame.truth, frame.differs, mask, frame.background)
+
+
+def _lpips(frame: Frame, mask: Mask | None) -> float | str:
+    """Painted and cropped to the body's box, so that the same crop serves every region of a frame."""
+    if mask is None:
+        return _network("vgg", "[-1,1]", frame.pred, frame.truth)
+    box = frame.regions.get("box", "region 'box', to which LPIPS crops, was not given")
+    if isinstance(box, str):
+        return box
+    return _network("vgg", "[-1,1]", frame.pred, frame.truth, mask, frame.background, box)
+
+
+def _painted(metric: str, variant: str, value_range: str) -> Callable[[str, Color], Identity]:
+    """The identity of a metric that paints what lies outside a region."""
+
+    def identity(region: str, background: Color) -> Identity:
+        painted = "" if region == "full" else background_part(background)
+        return Identity(metric, variant, value_range, region, version=1, background=painted)
+
+    return identity
+
+
+def _without(net: str) -> Callable[[], str]:
+    """What is lacking for LPIPS with this trunk."""
+
+    def lacking() -> str:
+        from ihbench.metrics import lpips
+
+        return lpips.lacking(net)
+
+    return lacking
+
+
+def _unpainted(metric: str, variant: str, value_range: str) -> Callable[[str, Color], Identity]:
+    return lambda region, background: Identity(metric, variant, value_range, region, version=1)
+
+
+IHBENCH = Preset(
+    name="ihbench",
+    about="8-bit images; pooled PSNR, Gaussian SSIM, LPIPS (VGG) and FLIP; regions painted first, nothing leaks in",
+    source="this bench",
+    prepare=_prepare_rounded,
+    measures=(
+        Measure(
+            _unpainted("psnr", "pooled", "range1"),
+            _psnr,
+            "-10 log10 of the mean squared error over the region's pixels and channels",
+        ),
+        Measure(
+            _painted("ssim", "gauss11-1.5", "range1"),
+            _ssim,
+            "mean over the region of the SSIM map: Gaussian 11×11, sigma 1.5, population moments, mirrored edges",
+        ),
+        Measure(
+            _painted("lpips", "vgg-0.1", "[-1,1]"),
+            _lpips,
+            "LPIPS v0.1, VGG, fed [-1,1]; regions cropped to the body's box",
+            slow=True,
+            lacking=_without("vgg"),
+        ),
+        Measure(
+            _painted("flip", "ldr-67ppd", "srgb"),
+            _flip,
+            "mean over the region of the LDR-FLIP map at 67 pixels per degree; needs no weights",
+        ),
+    ),
+    needs=("box",),
+)
+
+
+# ----------------------------------------------------------------------------------------------------
+# Released evaluators
+
+
+def _floats(pred: NDArray, truth: NDArray, regions: Mapping[str, Region], background: Color) -> tuple:
+    return as_float(pred), as_float(truth)
+
+
+def _clamped(image: NDArray) -> NDArray:
+    return np.clip(as_float(image), 0, 1)
+
+
+def _outside(image: NDArray, region: Region, background: Color) -> NDArray:
+    """The image painted outside a region, in its own type."""
+    if region is None:
+        return image
+    paint = np.asarray(background) * (255 if image.dtype == np.uint8 else 1)
+    return np.where(np.asarray(region)[..., None], image, paint.astype(image.dtype))
+
+
+def _boxed(
+    box: str, pred_to: Callable[[NDArray], NDArray], truth_to: Callable[[NDArray], NDArray], both: bool
+) -> Callable[..., tuple[NDArray, NDArray] | str]:
+    """Paint the prediction, or both images, outside the projected box, then convert each."""
+
+    def prepare(
+        pred: NDArray, truth: NDArray, regions: Mapping[str, Region], background: Color
+    ) -> tuple[NDArray, NDArray] | str:
+        region = regions.get(box, f"region {box!r}, outside of which this evaluator paints, was not given")
+        if isinstance(region, str):
+            return region
+        pred = _outside(pred, region, background)
+        return same_type(pred_to(pred), truth_to(_outside(truth, region, background) if both else truth))
+
+    return prepare
+
+
+def _network(
+    net: str,
+    feed: str,
+    pred: NDArray,
+    truth: NDArray,
+    mask: Mask | None = None,
+    background: Color = (1.0, 1.0, 1.0),
+    crop: Mask | None = None,
+) -> float | str:
+    """LPIPS, or why there is none."""
+    from ihbench.metrics.lpips import lpips
+
+    try:
+        return lpips(pred, truth, mask, net=net, feed=feed, background=background, crop=crop)
+    except BadInput as error:
+        return str(error)
+
+
+def _whole_lpips(net: str, feed: str) -> Compute:
+    return lambda frame, mask: _network(net, feed, frame.pred, frame.truth)
+
+
+def _map_ssim(window: Window, crop_scalar: Window) -> Compute:
+    """Mean over the mask of the unpainted map; the whole frame's scalar leaves out the library's border."""
+
+    def compute(frame: Frame, mask: Mask | None) -> float:
+        chosen = crop_scalar if mask is None else window
+        return mean_ssim(frame.pred, frame.truth, frame.differs, mask, chosen, background=None)
+
+    return compute
+
+
+def _whole_ssim(window: Window) -> Compute:
+    return lambda frame, mask: mean_ssim(frame.pred, frame.truth, frame.differs, None, window)
+
+
+def _channels_psnr(frame: Frame, mask: Mask | None) -> float:
+    return frame.squared_error.mean_of_channels(mask)
+
+
+def _box_ssim(frame: Frame, mask: Mask | None) -> float:
+    """SSIM of both images painted outside the box and cut to its bounding rectangle."""
+    if mask is None:
+        return mean_ssim(frame.pred, frame.truth, frame.differs, None, SKIMAGE)
+    rectangle = bounds(mask)
+    assert rectangle is not None  # evaluate() hands over masks with pixels only
+    pred, truth = (_outside(image, mask, frame.background)[rectangle] for image in (frame.pred, frame.truth))
+    return ssim(
+        pred, truth, window=7, sigma=None, data_range=2.0, crop=3, sample=True
+    )  # fmt: skip
+
+
+def _gtu_psnr(frame: Frame, mask: Mask | None) -> float:
+    """PSNR of the images times the mask, over the frame, minus the log-area: PSNR over the mask's pixels."""
+    return psnr(frame.pred, frame.truth, mask)
+
+
+def _gtu_ssim(frame: Frame, mask: Mask | None) -> float:
+    """Both images black outside the mask, 5 px of the map cut off, the mean over what is left of the mask."""
+    return mean_ssim(frame.pred, frame.truth, frame.differs, mask, TORCHMETRICS_CROP, background=0.0)
+
+
+def _gtu_lpips(frame: Frame, mask: Mask | None) -> float | str:
+    """Mid-grey, 0 after the mapping to [-1,1], outside the mask; the whole frame."""
+    whole = np.ones(frame.pred.shape[:2], np.bool_)
+    return _network("alex", "[-1,1]", frame.pred, frame.truth, mask, (0.5, 0.5, 0.5), whole)
+
+
+def _measures(
+    evaluator: str,
+    psnr_of: Compute,
+    psnr_form: str,
+    ssim_of: Compute,
+    ssim_form: str,
+    ssim_range: str,
+    lpips_of: Compute | None,
+    lpips_form: str,
+    lpips_feed: str,
+    regions: tuple[str, ...],
+) -> tuple[Measure, ...]:
+    """PSNR, SSIM and LPIPS of a released evaluator under its own name."""
+    found = [
+        Measure(
+            _unpainted("psnr", f"{evaluator}-{psnr_form}", "range1"),
+            psnr_of,
+            {"pooled": "mean squared error pooled over pixels and channels", "channels": "mean of channel PSNRs"}[
+                psnr_form
+            ],
+            regions,
+        ),
+        Measure(_unpainted("ssim", f"{evaluator}-{ssim_form}", ssim_range), ssim_of, SSIM_FORMS[ssim_form], regions),
+    ]
+    if lpips_of is not None:
+        about = f"LPIPS v0.1, {lpips_form}, fed {lpips_feed}"
+        identity = _unpainted("lpips", f"{evaluator}-{lpips_form}", lpips_feed)
+        found.append(Measure(identity, lpips_of, about, regions, slow=True, lacking=_without(lpips_form)))
+    return tuple(found)
+
+
+SSIM_FORMS = {
+    "uniform7": "scikit-image's uniform 7×7, sample moments, 3 px of the edges cut off, data range 2",
+    "uniform7-map": "region mean of scikit-image's uniform 7×7 map, sample moments, data range 2, nothing painted",
+    "gauss11-zero": "Gaussian 11×11, sigma 1.5, zeros beyond the edges",
+    "gauss11-crop5": "Gaussian 11×11, sigma 1.5, 5 px of the edges cut off",
+    "gauss11": "Gaussian 11×11, sigma 1.5, edges reflected, none cut off",
+}
+
+NEURALBODY = Preset(
+    name="neuralbody",
+    about="the projected 3-D box: PSNR over its pixels, SSIM on its bounding rectangle",
+    source="zju3dv/neuralbody 3c516b9 lib/evaluators/if_nerf.py:15-68; scikit-image 0.14 compare_ssim",
+    prepare=_floats,
+    measures=_measures("neuralbody", _psnr, "pooled", _box_ssim, "uniform7", "range2", None, "", "", ("box+0.05",)),
+    needs=("box+0.05",),
+)
+
+HUMANNERF = Preset(
+    name="humannerf",
+    about="the whole frame in 8 bits, both images painted outside the projected box",
+    source="chungyiweng/humannerf c753322 run.py:36-49, core/utils/image_util.py:18; metrics as told in its issue 8",
+    prepare=_boxed("box+0.3", truncated, truncated, both=True),
+    measures=_measures(
+        "humannerf", _psnr, "pooled", _whole_ssim(SKIMAGE), "uniform7", "range2", _whole_lpips("vgg", "[-1,1]"),
+        "vgg", "[-1,1]", ("full",),
+    ),
+    needs=("box+0.3",),
+)  # fmt: skip
+
+OCCNERF = Preset(
+    name="occnerf",
+    about="8 bits; its vis is our body (on OcMotion our visible), its body our box; region means of one SSIM map",
+    source="tiangexiang/OccNeRF 1cb1ef3 eval.py (unpack_to_image to psnr_metric, eval_model)",
+    prepare=_boxed("box+0.3", truncated, truncated, both=True),
+    measures=_measures(
+        "occnerf", _psnr, "pooled", _map_ssim(SKIMAGE_MAP, SKIMAGE), "uniform7-map", "range2", None, "", "",
+        ("body", "visible", "box+0.3", "full"),
+    ),
+    needs=("box+0.3", "body", "visible"),
+)  # fmt: skip
+
+GAUHUMAN = Preset(
+    name="gauhuman",
+    about="the whole frame, clamped; the prediction alone painted outside the box; also OccFusion's definition",
+    source="skhu101/GauHuman 732ec0d render.py:61-91, utils/image_utils.py:17-19, utils/loss_utils.py; "
+    "tiangexiang/OccFusion f41e091 stage1.py:302-351",
+    prepare=_boxed("box+0.05", _clamped, _clamped, both=False),
+    measures=_measures(
+        "gauhuman", _channels_psnr, "channels", _whole_ssim(SPLATTING), "gauss11-zero", "range1",
+        _whole_lpips("vgg", "[0,1]"), "vgg", "[0,1]", ("full",),
+    ),
+    needs=("box+0.05",),
+)  # fmt: skip
+
+GS_AVATAR_ZJU = Preset(
+    name="3dgs-avatar-zju",
+    about="the whole frame as rendered, not clamped",
+    source="mikeqzy/3dgs-avatar-release fc39bc5 utils/general_utils.py:221-291",
+    prepare=_floats,
+    measures=_measures(
+        "3dgs-avatar-zju", _psnr, "pooled", _whole_ssim(SKIMAGE), "uniform7", "range2",
+        _whole_lpips("vgg", "[-1,1]"), "vgg", "[-1,1]", ("full",),
+    ),
+)  # fmt: skip
+
+INSTANTAVATAR = Preset(
+    name="instantavatar",
+    about="the whole frame read back from 8-bit PNG; torchmetrics as of its time, and the SSIM of later releases",
+    source="tijiang13/InstantAvatar 3cdfd49 eval.py:14-33,94-105; also aipixel/GaussianAvatar d981c62 eval.py:16-35",
+    prepare=_prepare_rounded,
+    measures=(
+        *_measures(
+            "instantavatar", _psnr, "pooled", _whole_ssim(TORCHMETRICS_CROP), "gauss11-crop5", "range1",
+            _whole_lpips("alex", "[0,1]"), "alex", "[0,1]", ("full",),
+        ),
+        Measure(
+            _unpainted("ssim", "instantavatar-gauss11", "range1"), _whole_ssim(TORCHMETRICS), SSIM_FORMS["gauss11"],
+            ("full",),
+        ),
+    ),
+)  # fmt: skip
+
+GTU_MASK = Preset(
+    name="gtu-mask",
+    about="the true silhouette: PSNR over its pixels; SSIM with black, LPIPS with mid-grey outside it",
+    source="snuvclab/gtu 6b3026c utils/metric_utils.py:44-160",
+    prepare=_floats,
+    measures=_measures(
+        "gtu-mask", _gtu_psnr, "pooled", _gtu_ssim, "gauss11-crop5", "range1", _gtu_lpips, "alex", "[-1,1]", ("body",)
+    ),
+    needs=("body",),
+)

@@ -1,0 +1,241 @@
+"""A folder of images that somebody else's code rendered, matched to the test views of a scene.
+
+One image a test view, named by a pattern of the view's camera and frame. The default is the layout of a run's own
+`renders/` folder, with the scene's name in front where a folder holds several scenes:
+
+    {scene}/{camera}/{frame:06d}.png        {camera}/{frame:06d}.png
+
+Placeholders: {scene}; {camera}, the data set's name for it; {camera_index} from 0; {frame} of the capture; {index},
+the number of the test view in the protocol's order (all frames of a camera, then the next camera). A number may be
+padded ({frame:06d}). `ihbench score --names` prints the file expected for each view.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import string
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench import registry
+from ihbench.errors import BadInput
+from ihbench.metrics.images import Color
+from ihbench.views import TestViewKey
+
+DEFAULT_PATTERNS = ("{scene}/{camera}/{frame:06d}.png", "{camera}/{frame:06d}.png")
+PLACEHOLDERS = ("scene", "camera", "camera_index", "frame", "index")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".npy")
+LOSSY = (".jpg", ".jpeg")
+LARGEST_SIDE = 16384  # px; a header that says more is not believed
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """The images found for the test views of one scene, and what did not match."""
+
+    root: Path
+    pattern: str
+    files: dict[TestViewKey, Path]
+    missing: tuple[str, ...]  # paths expected below `root`, in the order of the views
+    surplus: tuple[str, ...]  # image files below `root` that no view of any scene expects
+
+    @property
+    def digest(self) -> str:
+        """Hash of the images' bytes and what they stand for: other images make another run."""
+        found = hashlib.sha256()
+        for key, path in self.files.items():
+            found.update(f"{key.name}\n".encode())
+            found.update(hashlib.sha256(path.read_bytes()).digest())
+        return found.hexdigest()[:16]
+
+    def read(self, key: TestViewKey, background: Color) -> NDArray | None:
+        """The image of one view, [H, W, 3]; None where there is none. See `read_image`."""
+        path = self.files.get(key)
+        return None if path is None else read_image(path, background)
+
+    def notes(self) -> list[str]:
+        """What a reader of the scores must know, a line each."""
+        found = []
+        if self.missing:
+            found.append(f"{len(self.missing)} of {len(self.missing) + len(self.files)} predictions are missing")
+        if self.surplus:
+            found.append(f"{len(self.surplus)} image files in the folder match no test view")
+        lossy = sum(path.suffix.lower() in LOSSY for path in self.files.values())
+        if lossy:
+            found.append(f"{lossy} predictions are JPEG: compression error counts as the method's")
+        return found
+
+
+def find_predictions(
+    root: Path, scene: str, keys: Sequence[TestViewKey], pattern: str | None = None, scenes: Sequence[str] = ()
+) -> Predictions:
+    """Match a folder's images to test views.
+
+    Without a pattern the default under which most files are found is taken. `scenes` are all those that are scored
+    from the folder: another scene's images are not surplus. Raises `BadInput` for a folder that is none, a pattern
+    that is malformed, leaves the folder or names one file for two views, and when no view has an image.
+    """
+    patterns = DEFAULT_PATTERNS if pattern is None else (pattern,)
+    best = max((_expected(p, scene, keys) for p in patterns), key=lambda found: _count(root, found[1]))
+    chosen, names = best
+    present = {key: root / name for key, name in names.items() if (root / name).is_file()}
+    every = image_files(root)
+    if not present:
+        raise BadInput(
+            f"predictions {root}: no image of any of the {len(keys)} test views of {scene}; expected "
+            f"{_some([names[key] for key in keys])}; found {_some([_below(root, p) for p in every])}; "
+            "say how they are named with --pattern"
+        )
+    known = set(present.values())
+    for other in scenes:
+        if other != scene:
+            known |= {root / name for name in _expected(chosen, other, keys)[1].values()}
+    return Predictions(
+        root,
+        chosen,
+        present,
+        tuple(names[key] for key in keys if key not in present),
+        tuple(_below(root, p) for p in every if p not in known),
+    )
+
+
+def image_files(root: Path) -> list[Path]:
+    """Every image file below a folder, sorted. Raises `BadInput` for a folder that is none."""
+    if not root.is_dir():
+        raise BadInput(f"predictions {root}: no such folder; expected one image a test view")
+    return sorted(p for p in root.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
+
+
+def expected_names(pattern: str | None, scene: str, keys: Sequence[TestViewKey]) -> list[str]:
+    """The file of each test view below the predictions' folder. Raises `BadInput` for a bad pattern."""
+    names = _expected(pattern or DEFAULT_PATTERNS[0], scene, keys)[1]
+    return [names[key] for key in keys]
+
+
+def read_image(path: Path, background: Color) -> NDArray:
+    """[H, W, 3]: uint8 from 8-bit files, float in [0, 1] from 16-bit PNG and float arrays (.npy).
+
+    Transparent images are composited on `background`; grey ones get three equal channels. Raises `BadInput` for what
+    cannot be read or is no image.
+    """
+    image = _read_array(path) if path.suffix.lower() == ".npy" else _read_picture(path)
+    if image.ndim == 2:
+        image = image[..., None]
+    if image.ndim != 3 or image.shape[2] not in (1, 2, 3, 4) or 0 in image.shape:
+        raise BadInput(
+            f"prediction {path}: expected an image [H, W], [H, W, 3] or [H, W, 4], got shape {image.shape}"
+        )
+    if image.shape[2] in (2, 4):
+        color, alpha = image[..., :-1], image[..., -1:]
+        if image.dtype == np.uint8:
+            if (alpha == 255).all():
+                image = color
+            else:
+                color, alpha = color / 255.0, alpha / 255.0
+                image = color * alpha + np.asarray(background) * (1 - alpha)
+        else:
+            image = color * alpha + np.asarray(background, image.dtype) * (1 - alpha)
+    return np.repeat(image, 3, axis=2) if image.shape[2] == 1 else np.ascontiguousarray(image)
+
+
+def _read_picture(path: Path) -> NDArray:
+    from PIL import Image
+
+    try:
+        with Image.open(path) as picture:
+            if max(picture.size) > LARGEST_SIDE:
+                raise BadInput(
+                    f"prediction {path}: {picture.size[0]}×{picture.size[1]} px; expected a test view's size"
+                )
+            if picture.mode in ("I", "I;16", "I;16B", "F"):
+                return np.asarray(picture).astype(np.float32) / (1 if picture.mode == "F" else 65535)
+            if picture.mode == "P":
+                picture = picture.convert("RGBA" if "transparency" in picture.info else "RGB")
+            if picture.mode not in ("L", "LA", "RGB", "RGBA"):
+                picture = picture.convert("RGB")
+            image = np.asarray(picture)
+    except BadInput:
+        raise
+    except Exception as error:  # a damaged file may raise anything
+        raise BadInput(f"prediction {path}: cannot be read as an image ({error})") from error
+    return _read_16_bit(path, image) if path.suffix.lower() == ".png" and image.ndim == 3 else image
+
+
+def _read_16_bit(path: Path, image: NDArray) -> NDArray:
+    """Colour PNG of 16 bits, of which Pillow keeps eight."""
+    with open(path, "rb") as file:
+        header = file.read(25)
+    if header[24:25] != b"\x10":
+        return image
+    import cv2
+
+    deep = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+    if deep is None or deep.dtype != np.uint16 or deep.ndim != 3:
+        raise BadInput(f"prediction {path}: cannot be read as a 16-bit PNG")
+    order = [2, 1, 0, 3][: deep.shape[2]]  # OpenCV has blue first
+    return deep[..., order].astype(np.float32) / 65535
+
+
+def _read_array(path: Path) -> NDArray:
+    try:
+        array = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise BadInput(f"prediction {path}: cannot be read as a plain numpy array ({error})") from error
+    if not isinstance(array, np.ndarray) or (array.dtype != np.uint8 and array.dtype.kind != "f"):
+        kind = getattr(array, "dtype", type(array).__name__)
+        raise BadInput(f"prediction {path}: expected uint8, or floats in [0, 1], got {kind}")
+    return array.astype(np.float32) if array.dtype.itemsize > 8 else array
+
+
+def _expected(pattern: str, scene: str, keys: Sequence[TestViewKey]) -> tuple[str, dict[TestViewKey, str]]:
+    """The pattern, and the relative path of every view under it."""
+    try:
+        fields = [name for _, name, _, _ in string.Formatter().parse(pattern) if name is not None]
+    except ValueError as error:
+        raise BadInput(f"--pattern {pattern!r}: {error}") from error
+    for name in fields:
+        if name not in PLACEHOLDERS:
+            raise BadInput(
+                f"--pattern {pattern!r}: no placeholder {{{name}}}; {registry.nearest(name, list(PLACEHOLDERS))}"
+            )
+    names: dict[TestViewKey, str] = {}
+    for index, key in enumerate(keys):
+        values: dict[str, Any] = {
+            "scene": scene,
+            "camera": key.camera_id,
+            "camera_index": key.camera,
+            "frame": key.frame,
+            "index": index,
+        }
+        try:
+            names[key] = pattern.format(**values)
+        except (ValueError, IndexError, AttributeError) as error:
+            raise BadInput(f"--pattern {pattern!r}: {error}") from error
+    path = PurePosixPath(next(iter(names.values()), "x"))
+    if path.is_absolute() or ".." in path.parts:
+        raise BadInput(f"--pattern {pattern!r}: leads out of the folder; expected a path below it")
+    if len(set(names.values())) < len(names):
+        raise BadInput(
+            f"--pattern {pattern!r}: names one file for several views; use {{camera}} and {{frame}}, or {{index}}"
+        )
+    return pattern, names
+
+
+def _count(root: Path, names: dict[TestViewKey, str]) -> int:
+    return sum((root / name).is_file() for name in names.values())
+
+
+def _below(root: Path, path: Path) -> str:
+    return path.relative_to(root).as_posix()
+
+
+def _some(names: Sequence[str], most: int = 2) -> str:
+    """The first names of a list, and how many more there are."""
+    if not names:
+        return "no image files"
+    return ", ".join(names[:most]) + (f", … ({len(names)} in all)" if len(names) > most else "")

@@ -1,0 +1,108 @@
+"""A run on record: found when it is done, guarded while it goes on, and always with an outcome."""
+
+from __future__ import annotations
+
+import gc
+import traceback
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from ihbench import atomic, machine
+from ihbench.errors import BadInput, Diverged
+from ihbench.ledger import Ledger, OnCheckpoint
+from ihbench.progress import Progress
+from ihbench.protocol import Protocol
+from ihbench.results import RunResult, read_result
+from ihbench.scene import Capture
+from ihbench.store import RunFolder, RunIdentity
+
+TRACEBACK = "traceback.txt"  # of a run that failed, in its folder
+
+
+class RecordedRun(ABC):
+    """One run in progress. `work` does it and sets the status "done"; how it ends otherwise is recorded here."""
+
+    def __init__(
+        self,
+        folder: RunFolder,
+        progress: Progress,
+        device: str = "cpu",
+        on_checkpoint: OnCheckpoint | None = None,
+    ):
+        self.folder, self.progress = folder, progress
+        before = folder.record["ledger"]
+        self.ledger = Ledger(folder.path, device=device, state=before, on_checkpoint=on_checkpoint)
+        if before is not None:
+            folder.restarted()
+            (folder.path / TRACEBACK).unlink(missing_ok=True)
+
+    @abstractmethod
+    def work(self) -> None:
+        """Do the run. May raise anything."""
+
+    def guarded(self) -> None:
+        """Run, and record how it ended. Only bad input and interruption are passed on."""
+        try:
+            self.work()
+        except Diverged as outcome:
+            self.ledger.event("diverged", step=outcome.step, reason=outcome.reason)
+            self._end("diverged", str(outcome))
+        except BadInput as outcome:
+            self._end("failed", str(outcome))
+            raise
+        except KeyboardInterrupt:
+            self._end("interrupted", "interrupted by the user")
+            raise
+        except Exception as outcome:
+            reason = f"{type(outcome).__name__}: {str(outcome).splitlines()[0] if str(outcome) else 'no message'}"
+            atomic.write_text(self.folder.path / TRACEBACK, traceback.format_exc())
+            self._end("failed", f"{reason} (see {TRACEBACK})")
+
+    def _end(self, status: str, reason: str) -> None:
+        self.describe()
+        try:
+            self.folder.set_status(status, reason, self.ledger)
+        except BadInput as error:  # the disk that failed the run may fail its record too; the first reason counts
+            self.progress.say(f"the run's record could not be written: {error}")
+
+    def describe(self, **more: Any) -> None:
+        """Put the clocks, the peak memory and more into the record."""
+        self.folder.record["about"] |= {
+            "fit_seconds": self.ledger.fit_seconds,
+            "total_seconds": self.ledger.seconds,
+            "peak_mb": machine.peak_memory_mb(),
+        } | more
+
+
+def recorded(
+    runs: Path,
+    identity: RunIdentity,
+    about: Mapping[str, Any],
+    force: bool,
+    make: Callable[[RunFolder], RecordedRun],
+) -> RunResult:
+    """Find the finished run of this identity, or do it. See `RunFolder.create` for what `force` does."""
+    folder = RunFolder.create(runs, identity, about, force)
+    with folder.lock():
+        if not folder.finished:
+            gc.collect()  # what an earlier run in this process left in cycles is not this run's memory
+            machine.reset_peak_memory()
+            try:
+                make(folder).guarded()
+            except BaseException:
+                folder.settle(keep_new=False)
+                raise
+            folder.settle(keep_new=True)
+    return read_result(folder.path)
+
+
+def about_scene(capture: Capture, protocol: Protocol) -> dict[str, Any]:
+    """What the record of any run on a scene says of it. The protocol's whole content makes a run folder complete."""
+    return {
+        "standin": capture.standin,
+        "variant": capture.variant,
+        "headline": protocol.headline,
+        "protocol": protocol.content,
+    }

@@ -1,0 +1,68 @@
+"""Opening again what a finished run was made on: its body, its capture, its scene under its protocol."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ihbench.body import load_body
+from ihbench.capture_digest import capture_digest
+from ihbench.data_source import open_capture, own_body, own_data, standin_root
+from ihbench.errors import BadInput
+from ihbench.protocol import Protocol, load_protocol, protocol_from
+from ihbench.scene import Capture
+from ihbench.store import RunFolder
+from ihbench.views import OccludedScene, open_scene
+
+if TYPE_CHECKING:
+    from ihbench.body import Body
+
+
+def reopen_body(folder: Path, body: Path | None) -> Body:
+    """The body model of a run's poses. Raises `BadInput` when the run needs an SMPL file and none is named."""
+    standin = RunFolder.open(folder).record["about"]["standin"]
+    if not standin and own_body(body) is None:
+        raise BadInput(f"{folder}: was made on real data; name the SMPL model file with --body or IHBENCH_BODY")
+    return load_body(None if standin else own_body(body))
+
+
+def reopen_capture(folder: Path, data: Path | None, body: Path | None) -> Capture:
+    """The capture of a run. Raises `BadInput` when other data lie where it is looked for."""
+    record = RunFolder.open(folder).record
+    about, identity = record["about"], record["identity"]
+    root = own_data(data)
+    if root is None and not about["standin"]:
+        raise BadInput(f"{folder}: was made on real data; name the folder of your copy with --data")
+    root = root or standin_root(identity["dataset"])
+    found = open_capture(identity["dataset"], root, identity["scene"], body)[0]
+    if found.standin != about["standin"]:
+        raise BadInput(
+            f"{root}: holds {found.standin or 'real data'}, the run was made on "
+            f"{about['standin'] or 'real data'}; name its data with --data"
+        )
+    return found
+
+
+def reopen_protocol(folder: Path) -> Protocol:
+    """The protocol of a run, as it was then. Raises `BadInput` when it is neither on record nor still the same."""
+    record = RunFolder.open(folder).record
+    identity, content = record["identity"], record["about"].get("protocol")
+    name, _, version = identity["protocol"].partition("@")
+    if content is None:
+        protocol = load_protocol(name, identity["profile"])
+    else:
+        protocol = protocol_from(content, identity["profile"], version)
+    if protocol.digest != identity["protocol_digest"]:
+        raise BadInput(f"{folder}: its protocol {identity['protocol']} is not on record and is another one now")
+    return protocol
+
+
+def reopen_scene(folder: Path, data: Path | None, body: Path | None) -> tuple[OccludedScene, Body]:
+    """The scene of a run, with its truth, and the body. Raises `BadInput` when the data are not those of the run."""
+    protocol, capture = reopen_protocol(folder), reopen_capture(folder, data, body)
+    on_record = RunFolder.open(folder).identity["data"]
+    if capture_digest(capture, protocol) not in on_record:
+        raise BadInput(
+            f"{folder}: the data of {capture.name} are not those that the run was made on; name its --data"
+        )
+    return open_scene(capture, protocol), reopen_body(folder, body)

@@ -1,0 +1,61 @@
+"""Scoring a finished run's stored renders again, under a metric preset that its protocol does not name.
+
+The renders are 8-bit PNG files. An evaluator that would have seen the floats sees them rounded here; InstantAvatar's
+reads PNG files itself, and our own preset rounds, so for those nothing changes. A run that could not compute a metric
+(no weights then) gets it the same way.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ihbench import atomic
+from ihbench.errors import BadInput
+from ihbench.metrics.evaluate import Preset, find_preset
+from ihbench.predictions import read_image
+from ihbench.progress import Progress
+from ihbench.reopen import reopen_scene
+from ihbench.results import view_rows
+from ihbench.score_stage import ScoreStage, render_path
+from ihbench.scoring import LoadedView, Scorer, ViewScores
+from ihbench.store import RunFolder
+
+
+def rescore(folder: Path, preset: str, data: Path | None, body: Path | None, progress: Progress) -> None:
+    """Score a run's renders and its calibration rows under a preset, into `presets/NAME.jsonl` of the run folder.
+
+    What is there already is left, unless a metric was absent for want of something that is here now. Raises
+    `BadInput` for an unknown preset, a run that is not done, and data that are not the run's.
+    """
+    chosen = find_preset(preset)
+    run = RunFolder.open(folder)
+    if run.status != "done":
+        raise BadInput(f"{folder}: is {run.status}, only finished runs have renders to score")
+    file = folder / "presets" / f"{chosen.name}.jsonl"
+    if file.is_file() and not _has_become_possible(file, chosen):
+        return
+    scene, model = reopen_scene(folder, data, body)
+    scorer = Scorer.build(scene, model, [chosen.name])
+    name = run.identity["method"]
+    rows = {name: lambda loaded: _render(run, loaded)}
+    rows |= ScoreStage(scorer, model, run, folder.parent, progress).calibration_rows()
+    results: dict[str, list[ViewScores]] = {row: [] for row in rows}
+    with run.lock(), progress.task(f"scoring {scene.capture.name} as {preset}", len(scene.test_keys)) as task:
+        for scored in scorer.scored(rows, range(len(scene.test_keys)), threaded=True):
+            for row, scores in scored.scores.items():
+                results[row].append(scores)
+            task.advance()
+        lines = [line for row, scores in results.items() for line in view_rows(row, scores)]
+        atomic.write_json_lines(file, [{"lacking": list(chosen.lacking())}, *lines])
+
+
+def _render(run: RunFolder, loaded: LoadedView):
+    path = render_path(run, loaded)
+    return read_image(path, (1.0, 1.0, 1.0)) if path.is_file() else None
+
+
+def _has_become_possible(file: Path, preset: Preset) -> bool:
+    """Whether a metric that was absent when the file was written can be computed now."""
+    lines = atomic.read_json_lines(file)
+    before = set(lines[0].get("lacking", ())) if lines else {"unknown"}
+    return bool(before - set(preset.lacking()))

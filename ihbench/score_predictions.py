@@ -1,0 +1,105 @@
+"""Scoring somebody else's renders as a run like any other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ihbench.capture_digest import capture_digest
+from ihbench.data_source import DataSource
+from ihbench.predictions import Predictions, find_predictions
+from ihbench.progress import Progress
+from ihbench.protocol import Protocol
+from ihbench.recorded_run import RecordedRun, about_scene, recorded
+from ihbench.results import RunResult
+from ihbench.score_stage import ScoreStage
+from ihbench.scoring import Scorer
+from ihbench.store import RunFolder, RunIdentity
+from ihbench.views import OccludedScene, hidden_fraction, open_scene
+
+if TYPE_CHECKING:
+    from ihbench.body import Body
+
+CODE = "predictions"  # stands where a method's run has the version of its code
+
+
+@dataclass(frozen=True)
+class ScoreRequest:
+    """What is to be scored."""
+
+    protocol: Protocol
+    folder: Path
+    name: str  # the row's name in tables
+    pattern: str | None = None
+    runs: Path = Path("runs")
+    body: Path | None = None  # SMPL model file, for real data
+    force: bool = False
+
+
+def score_scene(request: ScoreRequest, source: DataSource, scene: str, progress: Progress) -> RunResult:
+    """Score a folder's images of one scene, or find that it is done. Raises `BadInput` as `find_predictions` does."""
+    capture, body = source.open(scene, request.body, progress)
+    opened = open_scene(capture, request.protocol)
+    found = find_predictions(request.folder, scene, opened.test_keys, request.pattern, source.scenes)
+    identity = RunIdentity(
+        protocol=request.protocol.name,
+        protocol_digest=request.protocol.digest,
+        dataset=capture.dataset,
+        scene=capture.name,
+        data=f"{capture.standin or capture.variant} {capture_digest(capture, request.protocol)}",
+        method=request.name,
+        config={"predictions": found.digest},
+        profile=request.protocol.profile,
+        seed=0,
+        body=body.content_sha(),
+        code=CODE,
+    )
+    about = about_scene(capture, request.protocol) | {
+        "device": "cpu",
+        "provenance": CODE,
+        "predictions": {
+            "folder": request.folder.resolve().name,
+            "pattern": found.pattern,
+            "missing": list(found.missing),
+            "surplus": list(found.surplus),
+            "notes": found.notes(),
+        },
+        "changed": [],
+        "left_out": [],
+    }
+    return recorded(
+        request.runs,
+        identity,
+        about,
+        request.force,
+        lambda folder: _ScoreRun(request, found, opened, body, folder, progress),
+    )
+
+
+class _ScoreRun(RecordedRun):
+    """The scoring of one scene in progress."""
+
+    def __init__(
+        self,
+        request: ScoreRequest,
+        found: Predictions,
+        scene: OccludedScene,
+        body: Body,
+        folder: RunFolder,
+        progress: Progress,
+    ):
+        super().__init__(folder, progress)
+        self.request, self.found, self.scene, self.body = request, found, scene, body
+
+    def work(self) -> None:
+        with self.ledger.stage("load"):
+            self.scene.train.preload()
+        with self.ledger.stage("visibility"):
+            scorer = Scorer.build(self.scene, self.body)
+        with self.ledger.stage("score"):
+            stage = ScoreStage(scorer, self.body, self.folder, self.request.runs, self.progress, self.request.force)
+            background = self.scene.protocol.image.background
+            stage.run(self.request.name, lambda loaded: self.found.read(loaded.key, background), threaded=True)
+        self.describe(hidden_share=hidden_fraction(self.scene), fit_seconds=None)
+        self.folder.set_status("done", ledger=self.ledger)

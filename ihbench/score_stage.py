@@ -1,0 +1,116 @@
+"""The scoring stage of a run: every test view against the truth, calibration rows beside it, a contact sheet."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench import __version__, atomic
+from ihbench.calibration import ROWS, Calibration
+from ihbench.contact_sheet import SheetRow, contact_sheet, write_png
+from ihbench.metrics.eight_bit import rounded
+from ihbench.progress import Progress
+from ihbench.results import view_rows
+from ihbench.scoring import LoadedView, Predictor, Scorer
+from ihbench.store import RunFolder
+from ihbench.views import OccludedScene
+
+if TYPE_CHECKING:
+    from ihbench.body import Body
+
+SHEET_VIEWS = 5  # test views on the contact sheet
+SHEET_SIZE = 512  # px; smaller images are enlarged on it by a whole factor
+
+
+@dataclass(frozen=True)
+class ScoreStage:
+    """Scores one row, a method's or somebody's predictions, over all test views of a scene."""
+
+    scorer: Scorer
+    body: Body
+    folder: RunFolder
+    runs: Path  # where calibration rows are kept for all runs on the same data
+    progress: Progress
+    force: bool = False  # compute calibration rows again
+
+    def run(self, name: str, predict: Predictor, threaded: bool = False) -> None:
+        """Write scores.jsonl, calibration.jsonl, renders/ and contact_sheet.png. `threaded`: see `Scorer.scored`."""
+        scene = self.scorer.scene
+        rows, kept = {name: predict}, self._kept_calibration()
+        if kept is None:
+            rows |= self.calibration_rows()
+        on_sheet, sheet = spread(len(scene.test_keys), SHEET_VIEWS), []
+
+        def write_render(loaded: LoadedView, images: dict[str, NDArray | None]) -> None:
+            image = images[name]
+            if image is not None:
+                write_png(render_path(self.folder, loaded), _shown(image))
+
+        results = {row: [] for row in rows}
+        with self.progress.task("scoring", len(scene.test_keys)) as task:
+            indices = range(len(scene.test_keys))
+            for scored in self.scorer.scored(rows, indices, after_each=write_render, threaded=threaded):
+                for row, scores in scored.scores.items():
+                    results[row].append(scores)
+                if scored.loaded.index in on_sheet:
+                    sheet.append(_sheet_row(scene, scored.loaded, scored.images[name]))
+                task.advance()
+        if kept is None:
+            kept = [line for row in ROWS for line in view_rows(row, results[row])]
+            atomic.write_json_lines(self._calibration_file(), kept)
+        atomic.write_json_lines(self.folder.path / "calibration.jsonl", kept)
+        self.folder.write_scores(view_rows(name, results[name]))
+        identity, capture = self.folder.identity, scene.capture
+        title = f"{identity['protocol']}  {capture.name}  {name}  {scene.protocol.profile}"
+        if capture.standin:
+            title += f"  ({capture.standin})"
+        zoom = max(1, SHEET_SIZE // scene.protocol.image.size)
+        write_png(self.folder.path / "contact_sheet.png", contact_sheet(sheet, title, zoom))
+
+    def calibration_rows(self) -> dict[str, Predictor]:
+        """The predictors of the calibration rows."""
+        background = self.scorer.scene.protocol.image.background
+        calibration = Calibration.build(self.scorer.scene.train, self.body, self.scorer.texels, background)
+        return {row: (lambda loaded, row=row: calibration.predict(row, loaded.view)) for row in ROWS}
+
+    def _kept_calibration(self) -> list[dict[str, Any]] | None:
+        file = self._calibration_file()
+        return None if self.force or not file.is_file() else atomic.read_json_lines(file)
+
+    def _calibration_file(self) -> Path:
+        """Calibration rows depend on data, protocol and metrics only: they are computed once for all runs."""
+        identity, protocol = self.folder.identity, self.scorer.scene.protocol
+        parts = [__version__, *(identity[k] for k in ("protocol_digest", "scene", "data", "body"))]
+        for preset in self.scorer.presets:
+            parts += [*preset.identities(protocol.regions, protocol.image.background), *preset.lacking()]
+        digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+        return self.runs / "calibration" / f"{digest}.jsonl"
+
+
+def render_path(folder: RunFolder, loaded: LoadedView) -> Path:
+    """Where the 8-bit image of a test view lies in a run folder."""
+    return folder.renders / loaded.key.camera_id / f"{loaded.key.frame:06d}.png"
+
+
+def spread(n: int, k: int) -> list[int]:
+    """k of n indices, evenly spread from the first to the last."""
+    return sorted({int(i) for i in np.linspace(0, n - 1, min(k, n)).round()})
+
+
+def _shown(image: NDArray) -> NDArray[np.uint8]:
+    """The image in 8 bits, what is not finite in black."""
+    return rounded(np.nan_to_num(image, posinf=1.0) if image.dtype != np.uint8 else image)
+
+
+def _sheet_row(scene: OccludedScene, loaded: LoadedView, image: NDArray | None) -> SheetRow:
+    protocol, capture = scene.protocol, scene.capture
+    frames = protocol.training_frames(capture.name, capture.n_frames)
+    nearest = min(range(len(frames)), key=lambda k: abs(frames[k] - loaded.key.frame))
+    truth = loaded.view.image
+    shown = np.zeros_like(truth) if image is None else _shown(image).astype(np.float32) / 255
+    return SheetRow(loaded.key.name, scene.train[nearest].image, truth, shown)

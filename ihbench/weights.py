@@ -1,0 +1,161 @@
+"""Files of learned weights that metrics and methods use and the bench may not ship.
+
+Nothing is downloaded unless asked for. A file is looked for in the folder that `IHBENCH_WEIGHTS` names, then where
+torch keeps its own downloads, and is used only when its hash is right.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import secrets
+import urllib.error
+import urllib.request
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from ihbench import registry
+from ihbench.errors import BadInput
+from ihbench.progress import Progress
+
+CHUNK = 2**20  # bytes
+PATIENCE = 30  # s without a byte
+
+
+@dataclass(frozen=True)
+class WeightFile:
+    """One file, where it comes from, and how to know it."""
+
+    name: str  # what the bench calls it
+    file: str  # its file name
+    url: str
+    sha256: str  # the first hex digits at least; torchvision puts eight of them into the file's name
+    size_mb: float
+    used_by: str
+    licence: str
+
+
+def _torchvision(name: str, file: str, size_mb: float, net: str) -> WeightFile:
+    digits = file.rsplit("-", 1)[1].removesuffix(".pth")
+    url = f"https://download.pytorch.org/models/{file}"
+    licence = "torchvision, BSD-3-Clause; trained on ImageNet (non-commercial terms of use)"
+    return WeightFile(name, file, url, digits, size_mb, f"LPIPS with the {net} trunk", licence)
+
+
+FILES = {
+    weights.name: weights
+    for weights in (
+        _torchvision("lpips-vgg", "vgg16-397923af.pth", 527.8, "VGG-16"),
+        _torchvision("lpips-alex", "alexnet-owt-7be5be79.pth", 233.1, "AlexNet"),
+        _torchvision("lpips-squeeze", "squeezenet1_1-b8a52dc0.pth", 4.7, "SqueezeNet 1.1"),
+    )
+}
+
+_CHECKED: dict[tuple[str, int, int], bool] = {}  # path, size, time of change -> whether the hash was right
+
+
+def find_weights(name: str) -> WeightFile:
+    """The entry of that name. Raises `BadInput` with the nearest known one."""
+    if name not in FILES:
+        raise BadInput(f"weights {name!r}: not known; {registry.nearest(name, list(FILES))}")
+    return FILES[name]
+
+
+def folders() -> list[Path]:
+    """Where weight files are looked for, in order. The last is torch's own, found without importing torch."""
+    found = []
+    own = os.environ.get("IHBENCH_WEIGHTS")
+    if own:
+        found.append(Path(own).expanduser())
+    cache = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    torch_home = Path(os.environ.get("TORCH_HOME") or Path(cache) / "torch").expanduser()
+    return [*found, torch_home / "hub" / "checkpoints"]
+
+
+def locate(weights: WeightFile) -> Path | str:
+    """The file, or why there is none, in a line: what is missing, where it goes, how to get it."""
+    damaged = ""
+    for folder in folders():
+        path = folder / weights.file
+        if path.is_file():
+            if is_right(weights, path):
+                return path
+            damaged = (
+                f"{path} is damaged or another file (its hash does not begin with {weights.sha256}); remove it, then "
+            )
+    return (
+        f"{weights.used_by} needs {weights.file}: {damaged or 'missing; '}put it into {folders()[0]}, or on a connected "
+        f"machine run: ihbench weights fetch {weights.name}"
+    )
+
+
+def is_right(weights: WeightFile, path: Path) -> bool:
+    """Whether a file has the hash it should have; read once per process and state of the file."""
+    about = path.stat()
+    key = str(path.resolve()), about.st_size, about.st_mtime_ns
+    if key not in _CHECKED:
+        digest = hashlib.sha256()
+        with open(path, "rb") as file:
+            while chunk := file.read(CHUNK):
+                digest.update(chunk)
+        _CHECKED[key] = digest.hexdigest().startswith(weights.sha256)
+    return _CHECKED[key]
+
+
+def fetch(weights: WeightFile, progress: Progress) -> Path:
+    """Download a file into the first folder, whole and with the right hash or not at all.
+
+    Raises `BadInput` when the machine is offline, the disk is full, or what came is not the file.
+    """
+    there = locate(weights)
+    if isinstance(there, Path):
+        return there
+    target = folders()[0] / weights.file
+    by_hand = f"download {weights.url} elsewhere and put it into {target.parent}"
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
+    digest = hashlib.sha256()
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with urllib.request.urlopen(weights.url, timeout=PATIENCE) as source, open(temporary, "xb") as file:
+            with progress.task(f"fetching {weights.file} (MB)", round(weights.size_mb)) as task:
+                done = 0
+                while chunk := source.read(CHUNK):
+                    file.write(chunk)
+                    digest.update(chunk)
+                    done += len(chunk)
+                    task.advance(done // 10**6 - task.done)
+        if not digest.hexdigest().startswith(weights.sha256):
+            raise BadInput(
+                f"{weights.url}: what came is not {weights.file} (its hash differs); try again, or {by_hand}"
+            )
+        os.replace(temporary, target)
+    except (OSError, ValueError) as error:  # urllib's own errors are OSErrors
+        reason = getattr(error, "reason", error)
+        raise BadInput(f"{weights.file} could not be fetched ({reason}); {by_hand}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+    return target
+
+
+def states(names: Iterable[str] = FILES) -> list[dict[str, object]]:
+    """What `ihbench weights list` shows: "present", "missing" or "damaged", and where."""
+    found = []
+    for name in names:
+        weights = find_weights(name)
+        paths = [folder / weights.file for folder in folders()]
+        present = [path for path in paths if path.is_file()]
+        right = [path for path in present if is_right(weights, path)]
+        found.append(
+            {
+                "name": name,
+                "file": weights.file,
+                "size_mb": weights.size_mb,
+                "state": "present" if right else "damaged" if present else "missing",
+                "path": str((right or present or paths)[0]),
+                "used_by": weights.used_by,
+                "url": weights.url,
+                "licence": weights.licence,
+            }
+        )
+    return found
