@@ -71,7 +71,7 @@ def write_png(path: Path, image: NDArray[np.uint8]) -> None:
     from ihbench.atomic import write_bytes
 
     buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, "PNG", compress_level=3)
+    Image.fromarray(image).save(buffer, "PNG", compress_level=1)
     write_bytes(path, buffer.getvalue(), durable=False)
 
 

@@ -18,6 +18,7 @@ from ihbench.metrics.evaluate import Preset, evaluate, find_preset
 from ihbench.metrics.identity import Score
 from ihbench.regions import SurfaceMap
 from ihbench.scene import TestView
+from ihbench.threads import single_threaded_libraries
 from ihbench.views import OccludedScene, TestViewKey
 from ihbench.visibility import Visibility, texel_visibility
 
@@ -142,7 +143,7 @@ class Scorer:
         def whole(index: int) -> ScoredView:
             return finish(self.load(index), None)
 
-        with ThreadPoolExecutor(workers) as pool:
+        with single_threaded_libraries(), ThreadPoolExecutor(workers) as pool:
             try:
                 waiting: deque[Future] = deque()
                 if threaded:

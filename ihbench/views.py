@@ -18,11 +18,13 @@ from numpy.typing import NDArray
 
 from ihbench.camera import Camera
 from ihbench.errors import BadInput
+from ihbench.metrics.images import bounds
 from ihbench.occlusion import Occlusion, apply_rule
 from ihbench.protocol import ImageRule, Protocol
 from ihbench.scene import Capture, MaskState, TestView, TrainView
 
 View = TypeVar("View")
+LEVELS = (np.arange(256) / 255).astype(np.float32)  # of 8-bit images
 MAX_HELD = 700  # views kept in memory: 512² training views of this many take about 700 MB
 
 
@@ -125,21 +127,48 @@ class Undistorter:
     def shrink(self, image: NDArray[Any], how: str) -> NDArray[Any]:
         return self._cv2.resize(image, (self._rule.size, self._rule.size), interpolation=self._flags[how])
 
-    def composite(self, image: NDArray[np.uint8], silhouette: NDArray[np.bool_]) -> NDArray[np.uint8]:
-        """The person of the original image on the protocol's background, undistorted, resampled, 8 bit."""
-        alpha = self.straighten(silhouette.astype(np.uint8) * 255).astype(np.float32)[..., None] / 255
+    def person(
+        self, image: NDArray[np.uint8], silhouette: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        """The person of the original image on the protocol's background, undistorted, resampled, 8 bit; and the
+        silhouette treated likewise."""
+        alpha = self.straighten(silhouette.astype(np.uint8) * 255)
         if self._rule.edge == "hard":
-            alpha = (alpha >= 0.5).astype(np.float32)
-        full = self.straighten(image) * alpha + self.background * (1 - alpha)
-        small = np.clip(self.shrink(full, self._rule.resample_image), 0, 255)
-        return (small + (0.5 if self._rule.to_8bit == "round" else 1e-3)).astype(np.uint8)
+            alpha = (alpha >= 128).astype(np.uint8) * 255
+        return self._composited(image, alpha), self.shrink(alpha, self._rule.resample_mask) >= 128
 
-    def mask(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """A silhouette of the original image, undistorted and resampled."""
-        alpha = self.straighten(mask.astype(np.uint8) * 255)
-        if self._rule.edge == "hard":
-            alpha = np.where(alpha >= 128, 255, 0).astype(np.uint8)
-        return self.shrink(alpha, self._rule.resample_mask) >= 128
+    def _composited(self, image: NDArray[np.uint8], alpha: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """[size, size, 3]. Only the rectangle that holds the person is worked on: beyond it everything is background,
+        before and after resampling."""
+        size, (height, width) = self._rule.size, alpha.shape
+        # whole blocks of pixels, where resampling is a mean over blocks; all of the image elsewhere
+        block = width // size if self._rule.resample_image == "area" and width % size == 0 and width == height else 0
+        rows, columns = bounds(alpha > 0) or (slice(0, 1), slice(0, 1))
+        if block:
+            rows, columns = (slice(s.start // block * block, -(-s.stop // block) * block) for s in (rows, columns))
+        share = alpha[rows, columns, None].astype(np.float32) / 255
+        part = self._straight_part(image, rows, columns) * share + self.background * (1 - share)
+        if block:
+            small = np.empty((size, size, 3), np.uint8)
+            small[:] = self.background
+            target = tuple(slice(s.start // block, s.stop // block) for s in (rows, columns))
+            shape = part.shape[1] // block, part.shape[0] // block
+            small[target] = self._to_8bit(self._cv2.resize(part, shape, interpolation=self._cv2.INTER_AREA))
+            return small
+        full = np.empty((height, width, 3), np.float32)
+        full[:] = self.background
+        full[rows, columns] = part
+        return self._to_8bit(self.shrink(full, self._rule.resample_image))
+
+    def _to_8bit(self, image: NDArray[np.float32]) -> NDArray[np.uint8]:
+        return (np.clip(image, 0, 255) + (0.5 if self._rule.to_8bit == "round" else 1e-3)).astype(np.uint8)
+
+    def _straight_part(self, image: NDArray[np.uint8], rows: slice, columns: slice) -> NDArray[np.uint8]:
+        """A rectangle of the undistorted image."""
+        if self._maps is None:
+            return image[rows, columns]
+        maps = (m[rows, columns] for m in self._maps)
+        return self._cv2.remap(image, *maps, self._cv2.INTER_LINEAR)
 
     def touched(self, hidden: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Pixels with any part of a hidden original pixel in them: their colour is not to be trusted."""
@@ -185,10 +214,10 @@ def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
             person = person & ~hidden
             # before anything is resampled: lens and kernel would carry hidden colours out of the strip
             image = np.where(hidden[..., None], lens.background, image)
-        state = np.where(lens.mask(person), MaskState.PERSON, MaskState.BACKGROUND).astype(np.uint8)
+        image, mask = lens.person(image, person)
+        state = np.where(mask, MaskState.PERSON, MaskState.BACKGROUND).astype(np.uint8)
         if covered[k]:
             state[hidden_small] = MaskState.UNKNOWN
-        image = lens.composite(image, person)
         if covered[k]:
             image[hidden_small] = lens.background
         return TrainView(
@@ -208,10 +237,10 @@ def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
         if key.camera not in undistort:
             undistort[key.camera] = Undistorter(capture.camera(key.camera), protocol.image)
         lens, person = undistort[key.camera], silhouette(key.camera, key.frame)
-        image = lens.composite(capture.image(key.camera, key.frame), person)
+        image, mask = lens.person(capture.image(key.camera, key.frame), person)
         return TestView(
-            (image / 255).astype(np.float32),
-            lens.mask(person),
+            LEVELS[image],
+            mask,
             lens.camera,
             capture.body_pose(key.frame),
             key.frame,

@@ -81,13 +81,20 @@ def locate(weights: WeightFile) -> Path | str:
         if path.is_file():
             if is_right(weights, path):
                 return path
-            damaged = (
-                f"{path} is damaged or another file (its hash does not begin with {weights.sha256}); remove it, then "
-            )
+            damaged = f"{_short(path)} is damaged or another file (its hash does not begin with {weights.sha256}); "
+    what = f"{damaged}remove it, then put the right one" if damaged else "missing; put it"
     return (
-        f"{weights.used_by} needs {weights.file}: {damaged or 'missing; '}put it into {folders()[0]}, or on a connected "
-        f"machine run: ihbench weights fetch {weights.name}"
+        f"{weights.used_by} needs {weights.file}: {what} into {_short(folders()[0])}, or on a connected machine run: "
+        f"ihbench weights fetch {weights.name}"
     )
+
+
+def _short(path: Path) -> str:
+    """A path without the user's name: reasons go into run folders, and those are shared."""
+    try:
+        return f"~/{path.relative_to(Path.home())}"
+    except (ValueError, RuntimeError):
+        return str(path)
 
 
 def is_right(weights: WeightFile, path: Path) -> bool:

@@ -185,6 +185,7 @@ def _scenes(runs: list[RunResult]) -> str:
 def _remarks(runs: list[RunResult]) -> list[str]:
     """Why cells of the methods' rows are empty, what their means do not run over, what the plan left out."""
     absent: dict[tuple[str, str], list[str]] = {}
+    partly: dict[tuple[str, str, str], list[str]] = {}
     notes: list[str] = []
     for run in runs:
         for identity, mean in run.rows[run.method].items():
@@ -192,12 +193,14 @@ def _remarks(runs: list[RunResult]) -> list[str]:
             if mean.absent:
                 absent.setdefault((metric, mean.reason), []).append(region)
             elif mean.note:
-                notes.append(f"- {metric} {region} of {_plain(run.scene)}: {mean.note}")
+                partly.setdefault((run.scene, region, mean.note), []).append(metric)
         notes += [f"- left out: {o['field']} → {o['value']}: {o['reason']}" for o in run.record["about"]["left_out"]]
         notes += [
             f"- {_plain(f'{run.method} on {run.scene}')}: {note}"
             for note in run.record["about"].get("predictions", {}).get("notes", ())
         ]
+    for (scene, region, note), metrics in partly.items():
+        notes.append(f"- {region} of {_plain(scene)} ({', '.join(dict.fromkeys(metrics))}): {_plain(note)}")
     for (metric, reason), regions in absent.items():
         notes.append(f"- absent: {metric}, {', '.join(dict.fromkeys(regions))}: {_plain(reason)}")
     return sorted(set(notes))

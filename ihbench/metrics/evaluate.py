@@ -14,7 +14,17 @@ from numpy.typing import NDArray
 from ihbench import registry
 from ihbench.errors import BadInput
 from ihbench.metrics.identity import Identity, Score
-from ihbench.metrics.images import Color, Mask, as_image, as_mask, check_images, differing_pixels
+from ihbench.metrics.images import (
+    Color,
+    Mask,
+    as_image,
+    as_mask,
+    bounds,
+    check_images,
+    differing_pixels,
+    grown,
+    peak_of,
+)
 from ihbench.metrics.psnr import SquaredError
 
 Region = Mask | str | None  # a mask [H, W], the reason why there is none, or the whole frame
@@ -28,10 +38,40 @@ class Frame:
     truth: NDArray  # [H, W, C]
     background: Color
     regions: Mapping[str, Region] = field(default_factory=dict)  # of the frame, for metrics that crop to one
+    whole: dict[str, float] = field(default_factory=dict)  # values over the whole frame that a metric may use again
 
     @cached_property
     def differs(self) -> Mask:
         return differing_pixels(self.pred, self.truth)  # [H, W]
+
+    @cached_property
+    def foreground(self) -> Mask:
+        """[H, W] True where either image is anything but background."""
+        paint = np.asarray(self.background) * peak_of(self.pred.dtype)
+        plain = paint.astype(self.pred.dtype)
+        if (plain != paint).any():  # no pixel of this type has exactly the painted colour
+            return np.ones(self.differs.shape, np.bool_)
+        out = self.differs.copy()  # where they do not differ, one of them tells
+        for channel, value in enumerate(plain):
+            out |= self.truth[..., channel] != value
+        return out
+
+    def all_within(self, mask: Mask, radius: int) -> bool:
+        """Whether a window metric's sum over the frame is its sum over the mask, painted or not: outside the mask both
+        images are background already, and no window of this radius there reaches a pixel that differs. The projected
+        box of a body is such a mask as a rule."""
+        if (self.foreground & ~mask).any():
+            return False
+        area = bounds(self.differs)
+        if area is None:
+            return True
+        rows, columns = grown(area, radius, mask.shape)
+        if mask[rows, columns].all():
+            return True
+        import cv2
+
+        reached = cv2.dilate(self.differs[rows, columns].astype(np.uint8), np.ones((2 * radius + 1, 2 * radius + 1)))
+        return not (reached.astype(np.bool_) & ~mask[rows, columns]).any()
 
     @cached_property
     def squared_error(self) -> SquaredError:

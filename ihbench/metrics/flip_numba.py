@@ -203,6 +203,12 @@ def _fill_line(row, start, count, line):
 
 
 @njit(cache=True, nogil=True)
+def _clear(row, first, last):
+    for x in range(u64(first), u64(last)):
+        row[x] = 0.0
+
+
+@njit(cache=True, nogil=True)
 def _group(weights, k):
     return (
         weights[k], weights[k + 1], weights[k + 2], weights[k + 3], weights[k + 4], weights[k + 5], weights[k + 6]
@@ -258,8 +264,7 @@ def _filter_row(line, pad, radius, blur, slope, curve, channel, first, last, rin
     """
     for q in range(7):
         if CHANNEL_OF[q] == channel:
-            for x in range(first, last):
-                ring[q, slot, x] = 0.0
+            _clear(ring[q, slot], first, last)
             if q <= GAUSS:
                 _blur_row(line, pad - radius, blur[q], first, last, ring[q, slot])
     if channel == 0:
@@ -277,8 +282,7 @@ def _filter_columns(ring, at, middle, radius, blur, slope, curve, first, last, o
     at: at[middle + k] is the slot of the row k below
     """
     for q in range(7):
-        for x in range(first, last):
-            out[q, x] = 0.0
+        _clear(out[q], first, last)
     for q in range(7):
         if q != GAUSS:
             _blur_column(ring[q], at[middle - radius :], blur[min(q, GAUSS)], first, last, out[BLURRED_INTO[q]])
@@ -465,8 +469,9 @@ def flip_rows(pred, truth, differs, counted, top, bottom, radius, blur, slope, c
                 _lab_row(rows[image], to_xyz, to_rgb, first[y], last[y])
             _flip_row(rows[0], rows[1], exponent, knee_at, knee, largest, first[y], last[y], values)
             if counted.size:
-                for x in range(first[y], last[y]):
-                    counts[x] = 1.0 if counted[y, left + x] else 0.0
+                row, shift = counted[y], u64(left)
+                for x in range(u64(first[y]), u64(last[y])):
+                    counts[x] = 1.0 if row[shift + x] else 0.0
             total += _sum(values, counts, first[y], last[y])
             if keep.size:
                 for x in range(first[y], last[y]):

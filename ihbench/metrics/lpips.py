@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.errors import BadInput
-from ihbench.metrics.images import bounds, checked, peak_of
+from ihbench.metrics.images import as_mask, bounds, checked, peak_of
 from ihbench.weights import FILES, locate
 
 NETS = ("vgg", "alex", "squeeze")
@@ -57,18 +57,21 @@ def lpips(
     if net not in NETS or feed not in FEEDS:
         raise ValueError(f"lpips: expected net in {NETS} and feed in {FEEDS}, got {net!r}, {feed!r}")
     pred, truth, mask = checked(pred, truth, mask)
-    x, y = (_colors(image) for image in (pred, truth))
-    if mask is not None:
-        rectangle = bounds(mask if crop is None else crop)
-        if rectangle is None or not mask.any():
-            return math.nan
-        inside = mask[rectangle][..., None]
-        x, y = (np.where(inside, image[rectangle], np.asarray(background, np.float32)) for image in (x, y))
-    if x.size == 0 or not (np.isfinite(x).all() and np.isfinite(y).all()):
-        return math.nan
     network = load(net)
     if isinstance(network, str):
         raise BadInput(network)
+    rectangle = (slice(None), slice(None))
+    if mask is not None:
+        found = bounds(mask if crop is None else as_mask(crop))
+        if found is None or not mask.any():
+            return math.nan
+        rectangle = found
+    x, y = (_colors(image[rectangle]) for image in (pred, truth))
+    if mask is not None:
+        inside = mask[rectangle][..., None]
+        x, y = (np.where(inside, image, np.asarray(background, np.float32)) for image in (x, y))
+    if x.size == 0 or not (np.isfinite(x).all() and np.isfinite(y).all()):
+        return math.nan
     return 0.0 if np.array_equal(x, y) else network.distance(padded(x), padded(y), feed)
 
 

@@ -8,6 +8,7 @@ that was run on black gives its numbers under a protocol with a black background
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 
 import numpy as np
@@ -19,7 +20,7 @@ from ihbench.metrics.evaluate import Frame, Measure, Preset, Region
 from ihbench.metrics.identity import Identity, background_part
 from ihbench.metrics.images import Color, Mask, bounds
 from ihbench.metrics.psnr import psnr
-from ihbench.metrics.ssim import Window, mean_ssim, ssim
+from ihbench.metrics.ssim import HEADLINE, Window, mean_ssim, ssim
 
 SKIMAGE = Window(size=7, sigma=None, data_range=2.0, crop=3, sample=True)  # of float images, before version 0.20
 SKIMAGE_MAP = Window(size=7, sigma=None, data_range=2.0, sample=True)  # its map, to its edges
@@ -45,13 +46,31 @@ def _psnr(frame: Frame, mask: Mask | None) -> float:
 
 
 def _ssim(frame: Frame, mask: Mask | None) -> float:
-    return mean_ssim(frame.pred, frame.truth, frame.differs, mask, background=frame.background)
+    def over(region: Mask | None) -> float:
+        return mean_ssim(frame.pred, frame.truth, frame.differs, region, background=frame.background)
+
+    return 1 - _mean_over(frame, mask, "ssim", HEADLINE.size // 2, lambda region: 1 - over(region))
 
 
 def _flip(frame: Frame, mask: Mask | None) -> float:
-    from ihbench.metrics.flip import mean_flip
+    from ihbench.metrics.flip import PPD, Filters, mean_flip
 
-    return mean_flip(frame.pred, frame.truth, frame.differs, mask, frame.background)
+    def over(region: Mask | None) -> float:
+        return mean_flip(frame.pred, frame.truth, frame.differs, region, frame.background)
+
+    return _mean_over(frame, mask, "flip", Filters.of(PPD).radius, over)
+
+
+def _mean_over(
+    frame: Frame, mask: Mask | None, name: str, radius: int, mean: Callable[[Mask | None], float]
+) -> float:
+    """The mean over a mask of a map that is 0 where windows agree; from the frame's where that has all of it."""
+    if mask is None:
+        frame.whole[name] = mean(None)
+        return frame.whole[name]
+    if name in frame.whole and math.isfinite(frame.whole[name]) and frame.all_within(mask, radius):
+        return frame.whole[name] * mask.size / int(np.count_nonzero(mask))
+    return mean(mask)
 
 
 def _lpips(frame: Frame, mask: Mask | None) -> float | str:

@@ -65,7 +65,9 @@ def rasterize(
         face, b1, b2, depth = _rasterize_numpy(points, faces, height, width, NEAR)
     else:
         raise ValueError(f"z-buffer back end {backend!r}: expected 'auto', 'numba' or 'numpy'")
-    bary = np.stack([np.where(face >= 0, 1 - b1 - b2, 0), b1, b2], -1).astype(np.float32)
+    bary, hit = np.zeros((height, width, 3), np.float32), face >= 0
+    b1, b2 = b1[hit], b2[hit]
+    bary[hit] = np.stack([1 - b1 - b2, b1, b2], -1)
     return Raster(face, bary, depth.astype(np.float32))
 
 

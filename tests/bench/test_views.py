@@ -175,10 +175,10 @@ def test_eight_bits(to_8bit, expected):
     rule = replace(fake_protocol().image, size=SIZE // 2, to_8bit=to_8bit)
     image = np.full((SIZE, SIZE, 3), 101, np.uint8)
     image[::2, ::2] = 100  # a quarter of every block: the mean is 100.75
-    got = Undistorter(a_camera(), rule).composite(image, np.ones((SIZE, SIZE), bool))
+    got = Undistorter(a_camera(), rule).person(image, np.ones((SIZE, SIZE), bool))[0]
     assert (got == expected).all()
     whole = np.full((SIZE, SIZE, 3), 77, np.uint8)
-    assert (Undistorter(a_camera(), rule).composite(whole, np.ones((SIZE, SIZE), bool)) == 77).all()
+    assert (Undistorter(a_camera(), rule).person(whole, np.ones((SIZE, SIZE), bool))[0] == 77).all()
 
 
 @pytest.mark.parametrize(("edge", "levels"), [("hard", {0, 255}), ("soft", set(range(256)))])
@@ -187,7 +187,7 @@ def test_edges(edge, levels):
     rule = replace(fake_protocol().image, size=SIZE, edge=edge, background=(0.0, 0.0, 0.0))
     person = rasterized(a_camera(), turning_capture().poses[0]).mask
     image = np.full((SIZE, SIZE, 3), 255, np.uint8)
-    got = set(np.unique(Undistorter(a_camera(distortion=DISTORTION), rule).composite(image, person)).tolist())
+    got = set(np.unique(Undistorter(a_camera(distortion=DISTORTION), rule).person(image, person)[0]).tolist())
     assert got <= levels
     assert (len(got) > 2) == (edge == "soft")
 
