@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -117,7 +117,7 @@ class Scorer:
 
     def scored(
         self,
-        rows: dict[str, Predictor],
+        rows: Mapping[str, Predictor],
         indices: Sequence[int],
         *,
         after_each: Callable[[LoadedView, dict[str, NDArray | None]], None] | None = None,

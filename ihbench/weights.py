@@ -124,14 +124,17 @@ def fetch(weights: WeightFile, progress: Progress) -> Path:
     digest = hashlib.sha256()
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        with urllib.request.urlopen(weights.url, timeout=PATIENCE) as source, open(temporary, "xb") as file:
-            with progress.task(f"fetching {weights.file} (MB)", round(weights.size_mb)) as task:
-                done = 0
-                while chunk := source.read(CHUNK):
-                    file.write(chunk)
-                    digest.update(chunk)
-                    done += len(chunk)
-                    task.advance(done // 10**6 - task.done)
+        with (
+            urllib.request.urlopen(weights.url, timeout=PATIENCE) as source,
+            open(temporary, "xb") as file,
+            progress.task(f"fetching {weights.file} (MB)", round(weights.size_mb)) as task,
+        ):
+            done = 0
+            while chunk := source.read(CHUNK):
+                file.write(chunk)
+                digest.update(chunk)
+                done += len(chunk)
+                task.advance(done // 10**6 - task.done)
         if not digest.hexdigest().startswith(weights.sha256):
             raise BadInput(
                 f"{weights.url}: what came is not {weights.file} (its hash differs); try again, or {by_hand}"

@@ -64,9 +64,16 @@ def _reports() -> dict[str, str]:
 
 
 def _metrics() -> dict[str, str]:
-    from ihbench.metrics.evaluate import PRESETS
-
-    return {preset.name: preset.about for preset in PRESETS.values()}
+    """Each preset, and below it each of its identity strings with the definition in a line."""
+    found = {}
+    for name in registry.names("metric preset"):
+        preset = registry.load("metric preset", name)
+        found[name] = f"{preset.about} [{preset.source}]"
+        for measure in preset.measures:
+            regions = "" if measure.regions is None else f" (over {', '.join(measure.regions)})"
+            identity = str(measure.identity("REGION", (1.0, 1.0, 1.0)))
+            found[f"  {identity}"] = measure.about + regions
+    return found
 
 
 _DESCRIBE = {

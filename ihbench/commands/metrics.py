@@ -22,7 +22,7 @@ TABLE_WIDTH = 165  # characters; a narrower terminal would cut the numbers
 @dataclass(frozen=True)
 class Check:
     verb: Annotated[Literal["check"], tyro.conf.Positional]
-    """check: compare every metric with its float64 oracle, other libraries and stored values; status 1 if one is off."""
+    """check: compare every metric with its oracle, other libraries and stored values; status 1 if one is off."""
     lpips_examples: Path | None = None
     """Folder with ex_ref.png, ex_p0.png and ex_p1.png of the LPIPS authors, whose values they publish."""
     all: bool = False

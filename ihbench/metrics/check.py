@@ -179,10 +179,10 @@ def _scikit_image(case: Case, x: NDArray, y: NDArray) -> Iterator[Outcome]:
         ("ssim gauss11, away from the edges", gaussian, Window(), INNER),
         ("ssim uniform7 map", {}, Window(7, None, sample=True), np.s_[:]),
     ):
-        _, reference = structural_similarity(x, y, data_range=1.0, channel_axis=2, full=True, **options)
+        reference: Any = structural_similarity(x, y, data_range=1.0, channel_axis=2, full=True, **options)[1]
         ours = ssim_map(case.pred, case.truth, window=window)
         yield label, float(ours[region].mean()), float(reference[region].mean()), FLOAT64
-    scalar = structural_similarity(x, y, data_range=2.0, channel_axis=2)
+    scalar: Any = structural_similarity(x, y, data_range=2.0, channel_axis=2)
     ours = ssim(case.pred, case.truth, window=7, sigma=None, data_range=2.0, crop=3, sample=True)
     yield "ssim uniform7 range2", ours, float(scalar), FLOAT64
 
@@ -192,8 +192,8 @@ def _torchmetrics(case: Case, x: NDArray, y: NDArray) -> Iterator[Outcome]:
 
     a, b = _as_torch(x), _as_torch(y)
     yield "psnr", psnr(case.pred, case.truth), float(peak_signal_noise_ratio(a, b, data_range=1.0)), FLOAT32
-    theirs = float(structural_similarity_index_measure(a, b, data_range=1.0))
-    yield "ssim gauss11 reflect", ssim(case.pred, case.truth, border="reflect"), theirs, FLOAT64
+    theirs: Any = structural_similarity_index_measure(a, b, data_range=1.0)
+    yield "ssim gauss11 reflect", ssim(case.pred, case.truth, border="reflect"), float(theirs), FLOAT64
 
 
 def _kornia(case: Case, x: NDArray, y: NDArray) -> Iterator[Outcome]:
@@ -210,7 +210,7 @@ def _flip_evaluator(case: Case, x: NDArray, y: NDArray) -> Iterator[Outcome]:
     import flip_evaluator
 
     clipped = [np.ascontiguousarray(np.clip(image, 0, 1), np.float32) for image in (y, x)]
-    _, theirs, _ = flip_evaluator.evaluate(*clipped, "LDR", applyMagma=False)
+    _, theirs, _ = flip_evaluator.evaluate(clipped[0], clipped[1], "LDR", applyMagma=False)
     yield "flip", flip(case.pred, case.truth), float(theirs), FLOAT32
 
 

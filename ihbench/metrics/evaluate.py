@@ -57,9 +57,9 @@ class Frame:
         return out
 
     def all_within(self, mask: Mask, radius: int) -> bool:
-        """Whether a window metric's sum over the frame is its sum over the mask, painted or not: outside the mask both
-        images are background already, and no window of this radius there reaches a pixel that differs. The projected
-        box of a body is such a mask as a rule."""
+        """Whether a window metric's sum over the frame is its sum over the mask, painted or not: outside the mask
+        both images are background already, and no window of this radius there reaches a pixel that differs. The
+        projected box of a body is such a mask as a rule."""
         if (self.foreground & ~mask).any():
             return False
         area = bounds(self.differs)

@@ -62,7 +62,8 @@ def lpips(
         raise BadInput(network)
     rectangle = (slice(None), slice(None))
     if mask is not None:
-        found = bounds(mask if crop is None else as_mask(crop))
+        cut = as_mask(crop)
+        found = bounds(mask if cut is None else cut)
         if found is None or not mask.any():
             return math.nan
         rectangle = found

@@ -2,8 +2,8 @@
 
 Made by `python -m tests.metrics.released`, which restates each released evaluator with the libraries it calls, in
 float64, on `person_case(96, 80, dtype=np.uint8)`: scikit-image 0.26.0, torchmetrics 1.9.0, torch 2.14.1, numpy 2.4.
-FLIP is the official evaluator's: flip_evaluator.evaluate(truth / 255, pred / 255, "LDR", applyMagma=False) in float32,
-flip-evaluator 1.7. LPIPS has none: it needs weights that the bench may not ship.
+FLIP is the official evaluator's: flip_evaluator.evaluate(truth / 255, pred / 255, "LDR", applyMagma=False) in
+float32, flip-evaluator 1.7. LPIPS has none: it needs weights that the bench may not ship.
 """
 
 from __future__ import annotations

@@ -51,10 +51,12 @@ def test_the_truth_scores_perfectly_and_a_grey_image_does_not(scorer):
     grey = scorer.score(loaded, np.full_like(loaded.view.image, 0.5)).scores
     assert set(best) == set(grey)
     assert {region_of(identity) for identity in best} == set(scorer.scene.protocol.regions)
+    perfect = {"psnr": math.inf, "ssim": 1.0, "flip": 0.0}
     for identity, score in best.items():
         if not score.absent:
-            assert score.value == (math.inf if identity.startswith("psnr") else 1)
-            assert grey[identity].value < score.value
+            metric = identity.partition("/")[0]
+            assert score.value == perfect[metric]
+            assert (grey[identity].value < score.value) == (metric != "flip")
 
 
 def test_an_error_counts_in_its_own_regions_only(scorer):
@@ -73,33 +75,58 @@ def test_another_size_is_refused(scorer):
         scorer.score(loaded, np.zeros((10, 48, 3), np.float32))
 
 
+def truth_of(loaded):
+    return loaded.view.image
+
+
+@pytest.mark.parametrize("threaded", [False, True])
 @pytest.mark.parametrize("chosen", [range(12), [7, 2, 2, 11], [3], [1, 0], []], ids=str)
-def test_views_come_in_order(scorer, chosen):
-    assert [loaded.index for loaded in scorer.load_all(chosen)] == list(chosen)
-    for loaded in scorer.load_all(chosen):
-        assert loaded.key == scorer.scene.test_keys[loaded.index]
+def test_views_come_in_order(scorer, chosen, threaded):
+    found = list(scorer.scored({"truth": truth_of}, chosen, threaded=threaded, slow=False))
+    assert [scored.loaded.index for scored in found] == list(chosen)
+    for scored in found:
+        loaded = scored.loaded
+        assert loaded.key == scorer.scene.test_keys[loaded.index] == scored.scores["truth"].key
         assert (loaded.view.camera_id, loaded.view.frame) == (loaded.key.camera_id, loaded.key.frame)
 
 
-def test_several_rows_read_every_view_once(scorer, reads):
+@pytest.mark.parametrize("threaded", [False, True])
+def test_several_rows_read_every_view_once(scorer, reads, threaded):
     fresh = open_scene(scorer.scene.capture, scorer.scene.protocol)
     reads.clear()
     seen = []
-    rows = {"truth": lambda view: view.image, "white": lambda view: np.ones_like(view.image)}
-    results = replace(scorer, scene=fresh).score_rows(
-        rows, range(12), lambda loaded, images: seen.append((loaded.index, sorted(images)))
-    )
-    assert seen == [(k, ["truth", "white"]) for k in range(12)]
-    assert {name: [score.key for score in scores] for name, scores in results.items()} == {
-        name: list(scorer.scene.test_keys) for name in rows
-    }
+    rows = {"truth": truth_of, "white": lambda loaded: np.ones_like(loaded.view.image)}
+    found = list(
+        replace(scorer, scene=fresh).scored(
+            rows, range(12), after_each=lambda loaded, images: seen.append((loaded.index, sorted(images))),
+            threaded=threaded, slow=False,
+        )
+    )  # fmt: skip
+    assert sorted(seen) == [(k, ["truth", "white"]) for k in range(12)]
     assert dict(reads) == {(key.camera, key.frame): 1 for key in scorer.scene.test_keys}
-    body = next(k for k in results["truth"][0].scores if k.startswith("psnr") and region_of(k) == "body")
-    assert all(score.scores[body].value == math.inf for score in results["truth"])
-    assert all(score.scores[body].value < 30 for score in results["white"])
+    body = next(k for k in found[0].scores["truth"].scores if k.startswith("psnr") and region_of(k) == "body")
+    assert all(scored.scores["truth"].scores[body].value == math.inf for scored in found)
+    assert all(scored.scores["white"].scores[body].value < 30 for scored in found)
 
 
-def test_an_error_while_reading_ahead_reaches_the_caller(scorer):
+def test_a_view_without_a_prediction_is_absent_in_everything(scorer):
+    (found,) = scorer.scored({"none": lambda loaded: None}, [2])
+    scores = found.scores["none"].scores
+    assert set(scores) == set(scorer.score(found.loaded, found.loaded.view.image).scores)
+    assert {score.reason for score in scores.values()} == {"no prediction of this view"}
+
+
+def test_a_presets_own_regions_are_provided(scorer):
+    legacy = Scorer.build(scorer.scene, BODY, ["occnerf", "gauhuman"])
+    loaded = legacy.load(0)
+    scores = legacy.score(loaded, loaded.view.image, slow=False).scores
+    assert "psnr/occnerf-pooled/range1/box+0.3/v1" in scores
+    assert all(score.value in (math.inf, 1.0) for score in scores.values() if not score.absent)
+    assert loaded.regions["box+0.3"].sum() > loaded.regions["box+0.05"].sum()
+
+
+@pytest.mark.parametrize("threaded", [False, True])
+def test_an_error_while_reading_ahead_reaches_the_caller(scorer, threaded):
     def broken(camera, frame, pixels):
         if frame == 6:
             raise BadInput("camera 1 frame 6: truncated file")
@@ -108,5 +135,8 @@ def test_an_error_while_reading_ahead_reaches_the_caller(scorer):
     scene = open_scene(replace(scorer.scene.capture, edit_image=broken), scorer.scene.protocol)
     read = []
     with pytest.raises(BadInput, match="truncated"):
-        read.extend(loaded.index for loaded in replace(scorer, scene=scene).load_all(range(12)))
-    assert read == [0, 1]
+        read.extend(
+            scored.loaded.index
+            for scored in replace(scorer, scene=scene).scored({"truth": truth_of}, range(12), threaded=threaded)
+        )
+    assert read in ([0, 1], [0], [])

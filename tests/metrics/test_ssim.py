@@ -13,7 +13,6 @@ from skimage.metrics import structural_similarity
 
 from ihbench.metrics import ssim, ssim_map
 from ihbench.metrics.oracle import ssim_map_oracle, ssim_oracle
-from ihbench.metrics.ssim import Window
 
 
 def pair(shape, seed: int = 0, noise: float = 0.2):

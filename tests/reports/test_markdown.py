@@ -49,19 +49,23 @@ def run(scene="a", method="ours", seed=0, psnr=20.0, ssim=0.5, truth=True, **cha
     return RunResult(Path("runs") / scene, record, rows if record["status"] == "done" else {})
 
 
+def titles(text):
+    """How many protocols, profiles or kinds of data have tables of their own."""
+    return len(re.findall(r"^## ", text, re.M))
+
+
 def tables(text):
     """Title -> rows of the table below it, each a dictionary of cells by column head."""
     found = {}
-    for part in text.split("## ")[1:]:
+    for part in text.split("### ")[1:]:
         lines = [re.split(r"(?<!\\) ?\| ?", line)[1:-1] for line in part.splitlines() if line[:1] == "|"]
         head, rows = (lines[0], lines[2:]) if lines else ([], [])
         found[part.splitlines()[0]] = [dict(zip(head, row, strict=True)) for row in rows]
     return found
 
 
-def row(text, label):
-    ((rows),) = tables(text).values()
-    (found,) = [cells for cells in rows if cells["method"] == label]
+def row(text, label, metric="PSNR ↑ (dB)"):
+    (found,) = [cells for cells in tables(text)[metric] if cells["method"] == label]
     return found
 
 
@@ -73,7 +77,7 @@ def row(text, label):
 )
 def test_runs_that_cannot_be_compared_never_share_a_table(change):
     text = write([run(), run(scene="b", psnr=30.0, **change)])
-    assert text.count("## ") == 2
+    assert titles(text) == 2
     assert text.count("| ours | 1 | 0 | 20.00") == text.count("| ours | 1 | 0 | 30.00") == 1
 
 
@@ -81,9 +85,9 @@ def test_runs_of_one_protocol_share_a_table_whatever_their_order():
     runs = [run("a", psnr=10.0), run("a", "theirs", psnr=11.0), run("b", psnr=20.0), run("b", "theirs", psnr=21.0)]
     for order in (runs, runs[::-1]):
         text = write(order)
-        assert text.count("## ") == 1
-        assert row(text, "ours")["PSNR↑ full"] == "15.00"
-        assert row(text, "theirs")["PSNR↑ full"] == "16.00"
+        assert titles(text) == 1
+        assert row(text, "ours")["full"] == "15.00"
+        assert row(text, "theirs")["full"] == "16.00"
 
 
 def test_stand_ins_are_named_as_such_and_real_data_too():
@@ -97,44 +101,45 @@ def test_stand_ins_are_named_as_such_and_real_data_too():
 def test_every_scene_counts_once_however_many_seeds_it_has():
     runs = [run("a", seed=seed, psnr=10.0 + 4 * seed) for seed in (0, 1, 2)]
     cells = row(write([*runs, run("b", psnr=20.0)]), "ours")
-    assert cells["PSNR↑ full"] == "17.00"  # (14 + 20) / 2, not the mean of the four runs, 15.5
+    assert cells["full"] == "17.00"  # (14 + 20) / 2, not the mean of the four runs, 15.5
     assert (cells["scenes"], cells["seeds"]) == ("2", "0, 1, 2")
 
 
 def test_other_switches_make_another_row():
     text = write([run(psnr=10.0), run(psnr=30.0, changed=["steps=5"])])
-    assert row(text, "ours")["PSNR↑ full"] == "10.00"
-    assert row(text, "ours (steps=5)")["PSNR↑ full"] == "30.00"
+    assert row(text, "ours")["full"] == "10.00"
+    assert row(text, "ours (steps=5)")["full"] == "30.00"
 
 
 def test_runs_of_another_version_of_the_code_are_never_averaged_with_these():
     text = write([run(psnr=10.0), run(psnr=30.0, code="1+new")])
-    assert row(text, "ours (code 1+old)")["PSNR↑ full"] == "10.00"
-    assert row(text, "ours (code 1+new)")["PSNR↑ full"] == "30.00"
+    assert row(text, "ours (code 1+old)")["full"] == "10.00"
+    assert row(text, "ours (code 1+new)")["full"] == "30.00"
     assert "code" not in write([run(code="1+new"), run("b", code="1+new"), run("b", "theirs")])
 
 
 def test_a_scene_without_the_number_is_left_out_of_the_mean_and_noted():
     text = write([run("a", psnr=10.0), run("b", psnr=math.nan)])
-    assert row(text, "ours")["PSNR↑ full"] == "10.00"
-    assert "- absent: hidden: nothing is hidden" in text
+    assert row(text, "ours")["full"] == "10.00"
+    assert "- absent: PSNR, full, body, hidden: nothing is hidden" in text
 
 
 def test_absent_and_infinite_numbers_are_no_numbers():
-    text = write([run(psnr=math.nan)])
-    assert row(text, "ours")["PSNR↑ full"] == "—"
-    assert row(text, "*truth*")["PSNR↑ full"] == "∞"
-    assert row(text, "*truth*")["SSIM↑ full"] == "1.0000"
+    text = write([run(psnr=math.nan), run("b", "theirs")])
+    assert row(text, "ours")["full"] == "—"
+    assert row(text, "*truth*")["full"] == "∞"
+    assert row(text, "*truth*", "SSIM ↑")["full"] == "1.0000"
 
 
 def test_decimals_follow_the_metric():
-    cells = row(write([run(psnr=12.3456, ssim=0.123456)]), "ours")
-    assert (cells["PSNR↑ full"], cells["SSIM↑ full"]) == ("12.35", "0.1235")
+    text = write([run(psnr=12.3456, ssim=0.123456)])
+    assert row(text, "ours")["full"] == "12.35"
+    assert row(text, "ours", "SSIM ↑")["full"] == "0.1235"
 
 
 def test_calibration_rows_count_every_scene_once_and_stand_below_the_methods():
     text = write([run("a"), run("a", seed=1), run("a", "theirs"), run("b")])
-    ((rows),) = tables(text).values()
+    rows = tables(text)["PSNR ↑ (dB)"]
     assert [cells["method"] for cells in rows] == ["ours", "theirs", "*truth*"]
     assert row(text, "*truth*")["scenes"] == "2"
     assert "- truth: the truth as prediction" in text
@@ -148,10 +153,17 @@ def test_seconds_are_means_and_memory_is_the_largest():
 # ------------------------------------------------------------------------------------------- what is said
 
 
-def test_the_headline_region_is_bold_and_columns_keep_metrics_together():
-    ((rows),) = tables(write([run()])).values()
-    metrics = [head for head in rows[0] if head.startswith(("PSNR", "SSIM"))]
-    assert metrics == [f"{m}↑ {r}" for m in ("PSNR", "SSIM") for r in ("full", "**body**", "hidden")]
+def test_every_metric_has_a_table_of_regions_with_the_headline_in_bold():
+    found = tables(write([run()]))
+    assert list(found) == ["PSNR ↑ (dB)", "SSIM ↑"]
+    for rows in found.values():
+        assert [head for head in rows[0] if head.strip("*") in REGIONS] == ["full", "**body**", "hidden"]
+
+
+def test_a_metric_that_no_method_has_is_said_once_and_has_no_table():
+    text = write([run(psnr=math.nan)])
+    assert "PSNR ↑ (dB)" not in tables(text)
+    assert "- absent: PSNR, full, body, hidden: nothing is hidden" in text
 
 
 def test_what_a_number_is_stands_below_the_table():
@@ -177,8 +189,8 @@ def test_views_that_a_mean_does_not_run_over_are_counted():
         result.rows["ours"][identity] = Mean(20.0, identity, "region is empty", n=3, absent_count=1)
     result.rows["ours"][PSNR.format("body")] = Mean(20.0, PSNR.format("body"), "", n=2, infinite=2)
     text = write([result])
-    assert text.count("- full of a: 1 of 4 absent: region is empty") == 1
-    assert "- body of a: 2 of 4 without any error (inf) left out" in text
+    assert text.count("- full of a (PSNR, SSIM): 1 of 4 absent: region is empty") == 1
+    assert "- body of a (PSNR): 2 of 4 without any error (inf) left out" in text
 
 
 def test_what_was_left_out_is_said_once():
@@ -190,6 +202,49 @@ def test_what_was_left_out_is_said_once():
 def test_words_from_elsewhere_cannot_break_the_table():
     odd = run("b", status="failed", reason="no\n| such | thing <script>")
     text = write([run(method="a|b", changed=["path=x|y\nz"]), odd])
-    ((rows),) = tables(text).values()
+    rows = tables(text)["PSNR ↑ (dB)"]
     assert [cells["method"] for cells in rows] == [r"a\|b (path=x\|y z)", "*truth*"]
     assert r"failed (no \| such \| thing &lt;script>)." in text
+
+
+# ---------------------------------------------------------------------------------- intervals and other presets
+
+
+def test_scenes_give_intervals_and_a_paired_test_with_what_it_could_have_found():
+    runs = [run(f"s{k}", psnr=20.0 + k, ssim=0.5) for k in range(6)]
+    runs += [run(f"s{k}", "theirs", psnr=18.0 + k + 0.1 * (k % 2), ssim=0.5) for k in range(6)]
+    text = write(runs)
+    cells = row(text, "ours", "body: mean over scenes and 95% interval")
+    assert cells["PSNR ↑"].startswith("22.50 [20.5")
+    line = next(line for line in text.splitlines() if line.startswith("- PSNR: ours against theirs"))
+    assert "+1.95" in line
+    assert "p = 0.031" in line
+    assert "significant;" in line
+    assert "would be found 80% of the time" in line
+
+
+def test_too_few_scenes_cannot_be_significant_and_one_has_no_interval():
+    runs = [
+        run(f"s{k}", name, psnr=value + k) for k in range(3) for name, value in (("ours", 30.0), ("theirs", 10.0))
+    ]
+    assert "cannot be significant: 3 scenes allow no p below 0.25" in write(runs)
+    assert "interval" not in write([run()])
+
+
+def test_a_preset_scored_later_has_a_table_of_its_own():
+    legacy = "psnr/gauhuman-channels/range1/full/v1"
+    result = run()
+    result.presets["gauhuman"] = {
+        "ours": {legacy: Mean(31.5, legacy, "", n=4)},
+        "truth": {legacy: Mean(math.inf, legacy, "", n=4)},
+    }
+    text = write([result], ["gauhuman"])
+    assert row(text, "ours", "preset gauhuman")["PSNR↑ full"] == "31.50"
+    assert row(text, "*truth*", "preset gauhuman")["PSNR↑ full"] == "∞"
+    assert legacy not in write([result])
+
+
+def test_predictions_are_labelled_and_have_no_fit_time():
+    result = run(fit_seconds=None)
+    result.record["about"]["provenance"] = "predictions"
+    assert row(write([result]), "ours (predictions)")["fit s"] == "—"
