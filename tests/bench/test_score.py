@@ -1,0 +1,176 @@
+"""`ihbench score`: folders of renders that somebody else made."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from ihbench import atomic
+from ihbench.errors import BadInput
+from ihbench.predictions import find_predictions, read_image
+from ihbench.run_loop import load_scene
+from ihbench.views import TestViewKey
+
+KEYS = [TestViewKey(c, f, f"cam{c}") for c in (1, 2) for f in (0, 30)]
+WHITE = (1.0, 1.0, 1.0)
+
+
+def picture(path, size=8, value=100):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.full((size, size, 3), value, np.uint8)).save(path)
+
+
+@pytest.fixture
+def truths(bench, tmp_path):
+    """The truth of every test view of standin-1 as PNG files, in the default layout."""
+    folder = tmp_path / "mine"
+    with bench.in_its_world():
+        scene, _ = load_scene(str(bench.protocol), "standin-1", profile="quick")
+        for view in scene.test:
+            path = folder / view.camera_id / f"{view.frame:06d}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(np.rint(view.image * 255).astype(np.uint8)).save(path)
+    return folder
+
+
+def score(bench, folder, *more):
+    words = ["score", "--protocol", bench.protocol, "--predictions", folder, "--runs", bench.runs]
+    return bench(*words, "--scene", "standin-1", "--profile", "quick", *more)
+
+
+def test_the_truth_is_perfect_in_every_metric_and_region(bench, truths):
+    outcome = score(bench, truths, "--json")
+    assert outcome.status == 0, outcome.err
+    (run,) = json.loads(outcome.out)["runs"]
+    assert run["predictions"]["missing"] == run["predictions"]["surplus"] == []
+    perfect = {"psnr": "inf", "ssim": 1.0, "flip": 0.0}
+    for identity, value in run["scores"]["mine"].items():
+        assert value in (perfect.get(identity.partition("/")[0]), "nan"), identity
+        assert value != "nan" or identity.startswith("lpips") or run["scores"]["truth"][identity] == "nan"
+    record = atomic.read_json(bench.folders()[0] / "run.json")
+    assert record["about"]["provenance"] == "predictions"
+    assert (bench.folders()[0] / "contact_sheet.png").is_file()
+
+
+def test_missing_and_surplus_files_are_reported_and_the_rest_is_scored(bench, truths):
+    files = sorted(truths.rglob("*.png"))
+    for path in files[:2]:
+        path.unlink()
+    shutil.copy(files[2], truths / "stray.png")
+    outcome = score(bench, truths)
+    assert outcome.status == 1
+    for path in files[:2]:
+        assert f"missing: {path.relative_to(truths)}" in outcome.err
+    assert "surplus: stray.png" in outcome.err
+    assert f"2 of {len(files)} absent: no prediction of this view" in outcome.out
+    assert "mine (predictions)" in outcome.out
+
+
+def test_a_report_shows_a_released_evaluators_numbers_beside_the_headline(bench_with_run):
+    bench = bench_with_run
+    outcome = bench("report", "--runs", bench.runs, "--preset", "gauhuman", "occnerf")
+    assert outcome.status == 0, outcome.err
+    assert "### preset gauhuman" in outcome.out
+    assert "### PSNR ↑ (dB)" in outcome.out
+    (folder,) = bench.folders()
+    before = (folder / "presets" / "occnerf.jsonl").read_bytes()
+    assert bench("report", "--runs", bench.runs, "--preset", "occnerf").out.count("| inpainthuman") >= 2
+    assert (folder / "presets" / "occnerf.jsonl").read_bytes() == before
+    assert bench("report", "--runs", bench.runs, "--preset", "gauhumann").status == 2
+
+
+def test_images_of_another_size_are_refused(bench, truths):
+    picture(next(truths.rglob("*.png")), size=7)
+    outcome = score(bench, truths)
+    assert outcome.status == 2
+    assert "has shape (7, 7, 3), expected (64, 64, 3)" in outcome.err
+
+
+def test_a_calibration_rows_name_is_refused(bench, truths):
+    assert score(bench, truths, "--name", "truth").status == 2
+
+
+# -------------------------------------------------------------------------------------------------- matching
+
+
+@pytest.mark.parametrize(
+    ("pattern", "names"),
+    [
+        (None, ["cam1/000000.png", "cam1/000030.png"]),
+        (None, ["s/cam1/000000.png", "s/cam1/000030.png"]),
+        ("c{camera_index:02d}_f{frame}.png", ["c01_f0.png", "c01_f30.png"]),
+        ("{index:05d}.png", ["00000.png", "00001.png"]),
+    ],
+)
+def test_patterns(tmp_path, pattern, names):
+    for name in names:
+        picture(tmp_path / name)
+    found = find_predictions(tmp_path, "s", KEYS, pattern)
+    assert [path.relative_to(tmp_path).as_posix() for path in found.files.values()] == names
+    assert list(found.files) == KEYS[:2]
+    assert len(found.missing) == 2
+
+
+@pytest.mark.parametrize(
+    ("pattern", "words"),
+    [
+        ("{cam}.png", "no placeholder {cam}"),
+        ("{frame}.png", "one file for several views"),
+        ("../{camera}/{frame}.png", "leads out of the folder"),
+        ("/x/{camera}/{frame}.png", "leads out of the folder"),
+        ("{camera", "expected"),
+        ("{camera:06d}{frame}.png", "camera"),
+    ],
+)
+def test_bad_patterns_are_refused(tmp_path, pattern, words):
+    picture(tmp_path / "a.png")
+    with pytest.raises(BadInput, match=words):
+        find_predictions(tmp_path, "s", KEYS, pattern)
+
+
+def test_a_folder_without_any_of_the_views_says_what_was_expected_and_found(tmp_path):
+    picture(tmp_path / "a.png")
+    with pytest.raises(BadInput, match=r"expected .*cam1/000000.png.*found a.png"):
+        find_predictions(tmp_path, "s", KEYS)
+    with pytest.raises(BadInput, match="no such folder"):
+        find_predictions(tmp_path / "none", "s", KEYS)
+
+
+# --------------------------------------------------------------------------------------------------- reading
+
+
+def test_transparent_images_are_composited_and_grey_ones_coloured(tmp_path):
+    rgba = np.zeros((2, 2, 4), np.uint8)
+    rgba[0, 0] = 200, 100, 0, 255
+    Image.fromarray(rgba).save(tmp_path / "a.png")
+    image = read_image(tmp_path / "a.png", (1.0, 0.5, 0.0))
+    np.testing.assert_allclose(image[0, 0] * 255, [200, 100, 0])
+    np.testing.assert_allclose(image[1, 1], [1.0, 0.5, 0.0])
+    Image.fromarray(np.full((2, 2), 7, np.uint8)).save(tmp_path / "g.png")
+    assert (read_image(tmp_path / "g.png", WHITE) == np.full((2, 2, 3), 7, np.uint8)).all()
+
+
+def test_sixteen_bits_and_arrays_keep_their_precision(tmp_path):
+    import cv2
+
+    deep = np.full((2, 2, 3), (1000, 2000, 3000), np.uint16)  # blue, green, red as OpenCV writes
+    cv2.imwrite(str(tmp_path / "d.png"), deep)
+    np.testing.assert_allclose(read_image(tmp_path / "d.png", WHITE)[0, 0] * 65535, [3000, 2000, 1000], rtol=1e-6)
+    np.save(tmp_path / "f.npy", np.full((2, 2, 3), 1.5, np.float32))
+    assert read_image(tmp_path / "f.npy", WHITE).max() == 1.5
+
+
+@pytest.mark.parametrize("content", [b"", b"\x89PNG\r\n\x1a\n cut", b"\x93NUMPY"])
+@pytest.mark.parametrize("name", ["a.png", "a.npy"])
+def test_damaged_files_are_named(tmp_path, content, name):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(BadInput, match=rf"{name}.*cannot be read"):
+        read_image(tmp_path / name, WHITE)
+
+
+def test_a_pickled_array_is_refused(tmp_path):
+    np.save(tmp_path / "p.npy", np.array([{"a": 1}], object), allow_pickle=True)
+    with pytest.raises(BadInput, match="plain numpy array"):
+        read_image(tmp_path / "p.npy", WHITE)
