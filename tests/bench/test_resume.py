@@ -92,12 +92,13 @@ def test_a_run_killed_while_scoring_ends_with_the_same_numbers(bench, finished):
     run_until_killed(
         bench,
         """
-        write, left = run_loop.write_png, [1, 1]
-        run_loop.write_png = lambda *a: write(*a) if left and left.pop() else die()
+        from ihbench import score_stage
+        write, left = score_stage.write_png, [1, 1]
+        score_stage.write_png = lambda *a: write(*a) if left and left.pop() else die()
         """,
     )
     (folder,) = bench.folders()
-    assert len(list((folder / "renders").rglob("*.png"))) == 2
+    assert len(list((folder / "renders").rglob("*.png"))) <= 2  # written on several threads
     assert not (folder / "scores.jsonl").exists()
     assert_continues_to_the_same_numbers(bench, finished, LAST)
 
