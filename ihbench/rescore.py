@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from numpy.typing import NDArray
+
 from ihbench import atomic
 from ihbench.errors import BadInput
 from ihbench.metrics.evaluate import Preset, find_preset
@@ -49,7 +51,7 @@ def rescore(folder: Path, preset: str, data: Path | None, body: Path | None, pro
         atomic.write_json_lines(file, [{"lacking": list(chosen.lacking())}, *lines])
 
 
-def _render(run: RunFolder, loaded: LoadedView):
+def _render(run: RunFolder, loaded: LoadedView) -> NDArray | None:
     path = render_path(run, loaded)
     return read_image(path, (1.0, 1.0, 1.0)) if path.is_file() else None
 

@@ -64,7 +64,7 @@ def _reports() -> dict[str, str]:
 
 
 def _metrics() -> dict[str, str]:
-    """Each preset, and below it each of its identity strings with the definition in a line."""
+    """Each preset, and after it each of its identity strings with the definition in a line."""
     found = {}
     for name in registry.names("metric preset"):
         preset = registry.load("metric preset", name)
@@ -72,7 +72,7 @@ def _metrics() -> dict[str, str]:
         for measure in preset.measures:
             regions = "" if measure.regions is None else f" (over {', '.join(measure.regions)})"
             identity = str(measure.identity("REGION", (1.0, 1.0, 1.0)))
-            found[f"  {identity}"] = measure.about + regions
+            found[identity] = measure.about + regions
     return found
 
 

@@ -5,13 +5,16 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from ihbench import atomic, registry
 from ihbench.commands.parse import options
 from ihbench.errors import BadInput
+
+if TYPE_CHECKING:
+    from ihbench.results import RunResult
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,6 @@ class ReportOptions:
 def main(argv: list[str]) -> int:
     chosen = options(ReportOptions, argv, "report", "Tables of finished runs.")
     from ihbench.metrics.evaluate import find_preset
-    from ihbench.progress import Progress
     from ihbench.results import read_result
 
     write = registry.load("report", chosen.format)
@@ -59,24 +61,37 @@ def main(argv: list[str]) -> int:
         find_preset(name)
     for folder in folders:
         try:
-            result = read_result(folder)
-            if chosen.preset and result.status == "done":
-                from ihbench.rescore import rescore
-
-                for name in chosen.preset:
-                    rescore(folder, name, chosen.data, chosen.body, Progress())
-                result = read_result(folder)
-            results.append(result)
+            results.append(read_result(folder))
         except BadInput as error:
             if chosen.run:
                 raise
             print(f"ihbench: left out: {error}", file=sys.stderr)
+    if chosen.preset:
+        results = [_with_presets(result, chosen) for result in results]
     text = write(results, chosen.preset)
     if chosen.out is None:
         print(text, end="")
     else:
         atomic.write_text(chosen.out, text)
     return 0
+
+
+def _with_presets(result: RunResult, chosen: ReportOptions) -> RunResult:
+    """The run with the numbers of the presets asked for; one whose data are not to be had is named and left out."""
+    from ihbench.progress import Progress
+    from ihbench.rescore import rescore
+    from ihbench.results import read_result
+
+    if result.status != "done":
+        return result
+    for name in chosen.preset:
+        try:
+            rescore(result.folder, name, chosen.data, chosen.body, Progress())
+        except BadInput as error:
+            if chosen.run:
+                raise
+            print(f"ihbench: not scored as {name}: {error}", file=sys.stderr)
+    return read_result(result.folder)
 
 
 def _matching(chosen: ReportOptions) -> tuple[Path, ...]:

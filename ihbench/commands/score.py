@@ -5,10 +5,14 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ihbench import registry
 from ihbench.commands.parse import options
 from ihbench.errors import BadInput
+
+if TYPE_CHECKING:
+    from ihbench.data_source import DataSource
 
 
 @dataclass(frozen=True)
@@ -116,7 +120,7 @@ def _with_folders(scenes: tuple[str, ...], root: Path, pattern: str | None) -> t
     return found or scenes
 
 
-def _print_names(chosen: ScoreOptions, source) -> int:
+def _print_names(chosen: ScoreOptions, source: DataSource) -> int:
     from ihbench.predictions import expected_names
     from ihbench.progress import Progress
     from ihbench.views import open_scene

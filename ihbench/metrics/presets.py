@@ -18,9 +18,8 @@ from ihbench.errors import BadInput
 from ihbench.metrics.eight_bit import as_float, rounded, same_type, truncated
 from ihbench.metrics.evaluate import Frame, Measure, Preset, Region
 from ihbench.metrics.identity import Identity, background_part
-from ihbench.metrics.images import Color, Mask, bounds
-from ihbench.metrics.psnr import psnr
-from ihbench.metrics.ssim import HEADLINE, Window, mean_ssim, ssim
+from ihbench.metrics.images import Color, Mask, bounds, differing_pixels
+from ihbench.metrics.ssim import HEADLINE, Window, mean_ssim
 
 SKIMAGE = Window(size=7, sigma=None, data_range=2.0, crop=3, sample=True)  # of float images, before version 0.20
 SKIMAGE_MAP = Window(size=7, sigma=None, data_range=2.0, sample=True)  # its map, to its edges
@@ -225,14 +224,7 @@ def _box_ssim(frame: Frame, mask: Mask | None) -> float:
     rectangle = bounds(mask)
     assert rectangle is not None  # evaluate() hands over masks with pixels only
     pred, truth = (_outside(image, mask, frame.background)[rectangle] for image in (frame.pred, frame.truth))
-    return ssim(
-        pred, truth, window=7, sigma=None, data_range=2.0, crop=3, sample=True
-    )  # fmt: skip
-
-
-def _gtu_psnr(frame: Frame, mask: Mask | None) -> float:
-    """PSNR of the images times the mask, over the frame, minus the log-area: PSNR over the mask's pixels."""
-    return psnr(frame.pred, frame.truth, mask)
+    return mean_ssim(pred, truth, differing_pixels(pred, truth), None, SKIMAGE)
 
 
 def _gtu_ssim(frame: Frame, mask: Mask | None) -> float:
@@ -364,8 +356,9 @@ GTU_MASK = Preset(
     about="the true silhouette: PSNR over its pixels; SSIM with black, LPIPS with mid-grey outside it",
     source="snuvclab/gtu 6b3026c utils/metric_utils.py:44-160",
     prepare=_floats,
+    # its PSNR of masked images, corrected by the log of the mask's area, is the PSNR over the mask's pixels
     measures=_measures(
-        "gtu-mask", _gtu_psnr, "pooled", _gtu_ssim, "gauss11-crop5", "range1", _gtu_lpips, "alex", "[-1,1]", ("body",)
+        "gtu-mask", _psnr, "pooled", _gtu_ssim, "gauss11-crop5", "range1", _gtu_lpips, "alex", "[-1,1]", ("body",)
     ),
     needs=("body",),
 )
