@@ -377,12 +377,19 @@ def _flip_row(pred, truth, exponent, knee_at, knee, largest, first, last, out):
     _combine_row(pred[EDGE_X], exponent, knee_at, knee, largest, first, last, out)
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
+@njit(cache=True, nogil=True, fastmath={"contract"})
 def _sum(values, counts, first, last):
-    total = 0.0
-    for x in range(u64(first), u64(last)):
-        total += counts[x] * values[x]
-    return total
+    """The sum of counts times values. Four sums side by side, in an order of our own: see `splat_numba._FAST`."""
+    a = b = c = d = 0.0
+    whole = first + (last - first) // 4 * 4
+    for x in range(u64(first), u64(whole), u64(4)):
+        a += counts[x] * values[x]
+        b += counts[x + u64(1)] * values[x + u64(1)]
+        c += counts[x + u64(2)] * values[x + u64(2)]
+        d += counts[x + u64(3)] * values[x + u64(3)]
+    for x in range(u64(whole), u64(last)):
+        a += counts[x] * values[x]
+    return (a + b) + (c + d)
 
 
 @njit(cache=True, nogil=True)

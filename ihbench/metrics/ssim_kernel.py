@@ -125,13 +125,23 @@ def sum_and_difference(pred, truth, inside, paint, s, d):
                     d[y, x, c] = 0.0
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
+@njit(cache=True, nogil=True, fastmath={"contract"})
 def _deficit(ssim, counts, first, last):
-    """The sum of counts (1 - ssim): values near 1 keep their digits."""
-    total = 0.0
-    for x in range(u64(first), u64(last)):
-        total += counts[x] * (1.0 - ssim[x])
-    return total
+    """The sum of counts (1 - ssim): values near 1 keep their digits.
+
+    Four sums side by side, in an order of our own: the compiler's differs between the process that compiles and those
+    that load the code from numba's cache.
+    """
+    a = b = c = d = 0.0
+    whole = first + (last - first) // 4 * 4
+    for x in range(u64(first), u64(whole), u64(4)):
+        a += counts[x] * (1.0 - ssim[x])
+        b += counts[x + u64(1)] * (1.0 - ssim[x + u64(1)])
+        c += counts[x + u64(2)] * (1.0 - ssim[x + u64(2)])
+        d += counts[x + u64(3)] * (1.0 - ssim[x + u64(3)])
+    for x in range(u64(whole), u64(last)):
+        a += counts[x] * (1.0 - ssim[x])
+    return (a + b) + (c + d)
 
 
 @njit(cache=True, nogil=True)

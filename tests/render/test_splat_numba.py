@@ -2,6 +2,9 @@
 
 import math
 import multiprocessing
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -290,3 +293,25 @@ def test_the_comparison_allows_only_the_threshold():
     tight = compare_with_twin(s, "numba")
     assert loose.at_threshold > 0.2 > tight.at_threshold
     assert loose.image_at_threshold == tight.image_at_threshold == 0
+
+
+def test_the_process_that_compiles_and_those_that_load_the_code_agree_to_the_last_bit(tmp_path):
+    code = """
+import hashlib, torch
+from ihbench.kernels import body_gaussians
+from ihbench.render.splat import render_gaussians
+torch.set_num_threads(1)
+scene = body_gaussians(2000, 64)
+leaves = [x.clone().requires_grad_() for x in (scene.means, scene.scales, scene.colors)]
+rgb, _ = render_gaussians(*leaves, scene.camera, backend="numba")
+(rgb * torch.randn(rgb.shape, generator=torch.Generator().manual_seed(0))).sum().backward()
+print(*[hashlib.sha256(x.detach().numpy().tobytes()).hexdigest() for x in (rgb, *[leaf.grad for leaf in leaves])])
+"""
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    first, second = (
+        subprocess.run(
+            [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+        ).stdout
+        for _ in range(2)
+    )
+    assert first == second
