@@ -22,7 +22,7 @@ def main(argv: list[str]) -> int:
     chosen = options(
         KernelOptions, argv, "kernels", "Error against the float64 oracle, and milliseconds, per back end."
     )
-    from ihbench.kernels import run_kernels
+    from ihbench.kernels.table import run_kernels
 
     run_kernels(chosen.kernel, chosen.json)
     return 0

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+BLOCK = 2**16  # values worked on at a time: they stay in the cache
+
 
 def rounded(image: NDArray) -> NDArray:
     """The nearest 8-bit image; values outside [0, 1] are clipped.
@@ -27,14 +29,18 @@ def truncated(image: NDArray) -> NDArray:
 def _to_8bit(image: NDArray, whole: np.ufunc) -> NDArray:
     if image.dtype == np.uint8:
         return image
-    scaled = np.clip(image, 0, 1)  # numpy keeps NaN
-    scaled *= 255
-    whole(scaled, out=scaled)
     if not np.isfinite(image.sum(dtype=np.float64)):  # a sum is NaN or infinite if one pixel is, or none is (HDR)
         bad = ~np.isfinite(image)
         if bad.any():
-            return np.where(bad, np.nan, scaled).astype(np.float64) / 255
-    return scaled.astype(np.uint8)
+            return np.where(bad, np.nan, whole(np.clip(image, 0, 1) * image.dtype.type(255))).astype(np.float64) / 255
+    out = np.empty(image.shape, np.uint8)
+    step = max(1, BLOCK // max(1, image[:1].size))
+    for top in range(0, len(image), step):
+        scaled = np.clip(image[top : top + step], 0, 1)
+        scaled *= 255
+        whole(scaled, out=scaled)
+        out[top : top + step] = scaled
+    return out
 
 
 def same_type(pred: NDArray, truth: NDArray) -> tuple[NDArray, NDArray]:

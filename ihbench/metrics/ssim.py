@@ -26,7 +26,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench.metrics.images import Mask, checked, differing_pixels, peak_of
+from ihbench.metrics.images import Mask, bounds, checked, differing_pixels, grown, peak_of
 
 K1, K2 = 0.01, 0.03
 BAND = 2**16  # about so many pixels are worked on at a time: their float64 sums and differences take 1.5 MB
@@ -151,6 +151,11 @@ class _Band:
 
 def _bands(differs: Mask, counted: Mask | None, radius: int) -> Iterator[_Band]:
     """Every counted pixel with a differing pixel in its window, as spans of rows."""
+    area = bounds(differs)
+    if area is None:
+        return
+    rows, columns = grown(area, radius, differs.shape)  # nothing beyond has a differing pixel in its window
+    differs = differs[rows, columns]
     first, last = _row_extents(differs)
     width = differs.shape[1]
     around = np.lib.stride_tricks.sliding_window_view
@@ -159,16 +164,16 @@ def _bands(differs: Mask, counted: Mask | None, radius: int) -> Iterator[_Band]:
     empty = first >= last
     first, last = np.maximum(first - radius, 0), np.minimum(last + radius, width)
     if counted is not None:
-        inner_first, inner_last = _row_extents(counted)
+        inner_first, inner_last = _row_extents(counted[rows, columns])
         first, last = np.maximum(first, inner_first), np.minimum(last, inner_last)
     last = np.where(empty, 0, last)
     work = np.flatnonzero(first < last)
     if len(work):
         step = max(4 * radius + 1, BAND // int((last - first)[work].max()))
         for top in range(work[0], work[-1] + 1, step):
-            rows = slice(top, min(top + step, work[-1] + 1))
-            if (first[rows] < last[rows]).any():
-                yield _Band(top, first[rows], last[rows])
+            span = slice(top, min(top + step, work[-1] + 1))
+            if (first[span] < last[span]).any():
+                yield _Band(rows.start + top, columns.start + first[span], columns.start + last[span])
 
 
 def _row_extents(mask: Mask) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

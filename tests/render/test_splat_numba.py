@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from ihbench.kernels import Gaussians, body_gaussians, compare_with_twin
+from ihbench.kernels.splats import Gaussians, body_gaussians, compare_with_twin
 from ihbench.render import splat_numba, splat_reference
 from ihbench.render.splat import Splats, render_gaussians
 from tests.render.test_splat import front_camera, random_gaussians
@@ -298,7 +298,7 @@ def test_the_comparison_allows_only_the_threshold():
 def test_the_process_that_compiles_and_those_that_load_the_code_agree_to_the_last_bit(tmp_path):
     code = """
 import hashlib, torch
-from ihbench.kernels import body_gaussians
+from ihbench.kernels.splats import body_gaussians
 from ihbench.render.splat import render_gaussians
 torch.set_num_threads(1)
 scene = body_gaussians(2000, 64)

@@ -1,62 +1,24 @@
-"""Work-precision of the bench's own kernels: milliseconds and error against the slow twin, for every back end.
-
-Behind `ihbench kernels`. A kernel is an entry of `KERNELS`: a function from the number of repetitions to table rows.
-"""
+"""Splat back ends: times, memory, and the error of images and gradients against the float64 twin."""
 
 from __future__ import annotations
 
-import ctypes
-import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ihbench import machine
 from ihbench.camera import Camera, look_at
-from ihbench.errors import BadInput
+from ihbench.kernels.measuring import Row, interleave, peak_mib, summary
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-Row = dict[str, Any]
-REPEATS = 15
-UNSTABLE = 0.25  # a spread above this share of the median is marked
 SPLAT_CASES = (("5k@128", 5_000, 128), ("20k@256", 20_000, 256), ("50k@512", 50_000, 512), ("200k@512", 200_000, 512))
 NO_GRADIENT = 1e-12  # a scene of clamped alphas has gradients of 1e-30; they mean 0
-TABLE_WIDTH = 100  # characters; a narrower terminal would cut the numbers
 WINDOW = 64  # px; side of the window in which the float64 twin is drawn
-
-
-def run_kernels(names: Sequence[str] | None = None, as_json: bool = False, repeats: int = REPEATS) -> list[Row]:
-    """Measure the kernels called `names` (all of them by default) and print the result; returns its rows.
-
-    Prints a table, or with `as_json` one JSON object {"machine": …, "rows": […]}. A row has kernel, case, backend,
-    the median and the interquartile range of the timings in ms (None where the kernel has no backward pass), the
-    memory the work needs beside its input in MiB, the errors against the twin, and `unstable`.
-
-    Raises BadInput for an unknown name or fewer than one repetition.
-    """
-    unknown = sorted(set(names or ()) - set(KERNELS))
-    if unknown:
-        raise BadInput(f"kernel {unknown[0]!r}: expected one of {', '.join(sorted(KERNELS))}")
-    if repeats < 1:
-        raise BadInput(f"kernel repetitions: expected at least 1, got {repeats}")
-    rows = [row for name in (names or KERNELS) for row in KERNELS[name](repeats)]
-    about = machine.identity()
-    if as_json:
-        print(json.dumps({"machine": about, "rows": rows}))
-    else:
-        _print_table(about, rows)
-    return rows
-
-
-# ----------------------------------------------------------------------------------------------------
-# Splats
 
 
 @dataclass(frozen=True)
@@ -212,9 +174,9 @@ def splat_rows(repeats: int, cases: Sequence[tuple[str, int, int]] = SPLAT_CASES
             _synchronize(rgb)
             return (middle - start) * 1e3, (time.perf_counter() - middle) * 1e3
 
-        timings = _interleave({b: lambda b=b: step(b) for b in backends}, repeats)
+        timings = interleave({b: lambda b=b: step(b) for b in backends}, repeats)
         if case == cases[0][0]:
-            timings |= _interleave({"reference": lambda: step("reference")}, 1, warm_up=0)
+            timings |= interleave({"reference": lambda: step("reference")}, 1, warm_up=0)
         for backend, samples in timings.items():
             errors = None
             if backend != "reference":
@@ -225,8 +187,8 @@ def splat_rows(repeats: int, cases: Sequence[tuple[str, int, int]] = SPLAT_CASES
                     "kernel": "splat",
                     "case": case,
                     "backend": backend,
-                    **_summary(samples),
-                    "peak_mib": _peak_mib(lambda b=backend: step(b)) if backend == "numba" else None,
+                    **summary(samples),
+                    "peak_mib": peak_mib(lambda b=backend: step(b)) if backend == "numba" else None,
                     "value_error": errors.image if errors else 0.0,
                     "gradient_error": max(errors.gradient.values()) if errors else 0.0,
                 }
@@ -247,127 +209,3 @@ def _synchronize(tensor: Tensor) -> None:
         import torch
 
         torch.cuda.synchronize(tensor.device)
-
-
-# ----------------------------------------------------------------------------------------------------
-# Z-buffer
-
-
-def zbuffer_rows(repeats: int, cases: Sequence[tuple[str, int, int]] = (("14k faces@512", 83, 512),)) -> list[Row]:
-    """The mesh z-buffer: numba against numpy, which define one function; the value error is the depth's, in m."""
-    from ihbench.render.zbuffer import rasterize
-
-    rows = []
-    for case, rings, size in cases:
-        points, faces = _sphere(rings, size)
-        backends = ["numpy", *(["numba"] if find_spec("numba") is not None else [])]
-
-        def step(backend: str, points=points, faces=faces, size=size) -> tuple[float, None]:
-            start = time.perf_counter()
-            rasterize(points, faces, size, size, backend)
-            return (time.perf_counter() - start) * 1e3, None
-
-        timings = _interleave({b: lambda b=b: step(b) for b in backends}, repeats)
-        truth = rasterize(points, faces, size, size, "numpy")
-        for backend, samples in timings.items():
-            raster = rasterize(points, faces, size, size, backend)
-            both = truth.mask & raster.mask
-            error = float(np.abs(raster.depth[both] - truth.depth[both]).max())
-            rows.append(
-                {
-                    "kernel": "zbuffer",
-                    "case": case,
-                    "backend": backend,
-                    **_summary(samples),
-                    "peak_mib": _peak_mib(lambda b=backend: step(b)),
-                    "value_error": error if (truth.face == raster.face).all() else float("inf"),
-                    "gradient_error": None,
-                }
-            )
-    return rows
-
-
-def _sphere(rings: int, size: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """A sphere that fills a size² image: projected points [V, 3] (px, px, m) and faces [2 rings (rings - 1), 3]."""
-    polar, azimuth = np.meshgrid(np.linspace(0, np.pi, rings), np.linspace(0, 2 * np.pi, rings + 1), indexing="ij")
-    points = np.stack([np.sin(polar) * np.cos(azimuth), np.cos(polar), np.sin(polar) * np.sin(azimuth)], -1)
-    points = points.reshape(-1, 3) * (0.45 * size, 0.45 * size, 0.5) + (0.5 * size, 0.5 * size, 3.0)
-    corner = np.arange(rings * (rings + 1)).reshape(rings, rings + 1)
-    a, b, c, d = (x.ravel() for x in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]))
-    return points, np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
-
-
-KERNELS: dict[str, Callable[[int], list[Row]]] = {"splat": splat_rows, "zbuffer": zbuffer_rows}
-
-
-# ----------------------------------------------------------------------------------------------------
-# Measuring
-
-Sample = tuple[float, float | None]  # ms forward, ms backward
-
-
-def _interleave(steps: dict[str, Callable[[], Sample]], repeats: int, warm_up: int = 2) -> dict[str, list[Sample]]:
-    """Time the steps in turn, so that a change of the machine's load meets all of them."""
-    for step in steps.values():
-        for _ in range(warm_up):
-            step()
-    timings: dict[str, list[Sample]] = {name: [] for name in steps}
-    for _ in range(repeats):
-        for name, step in steps.items():
-            timings[name].append(step())
-    return timings
-
-
-def _summary(samples: list[Sample]) -> Row:
-    """Median and interquartile range of forward and backward."""
-    row: Row = {"repeats": len(samples), "unstable": False}
-    for k, name in enumerate(("forward", "backward")):
-        values = [sample[k] for sample in samples]
-        if None in values:
-            row |= {f"{name}_ms": None, f"{name}_iqr_ms": None}
-            continue
-        low, median, high = np.percentile(np.array(values, dtype=np.float64), [25, 50, 75])
-        row |= {f"{name}_ms": float(median), f"{name}_iqr_ms": float(high - low)}
-        row["unstable"] |= bool(high - low > UNSTABLE * median)
-    return row
-
-
-def _peak_mib(step: Callable[[], object]) -> float | None:
-    """Memory that a step needs while it runs, in MiB; None where the system cannot say (not Linux with glibc)."""
-    try:
-        ctypes.CDLL(None).malloc_trim(0)  # give back what earlier steps left, or this one would need nothing new
-    except (OSError, AttributeError):
-        return None
-    before = machine.process_memory_mb("VmRSS")
-    if before is None or not machine.reset_peak_memory():
-        return None
-    step()
-    return max(0.0, machine.peak_memory_mb() - before)
-
-
-def _print_table(about: Row, rows: list[Row]) -> None:
-    from rich.box import SIMPLE
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(
-        "kernel", "case", "back end", "fwd ms", "bwd ms", "MiB", "error", "grad err", "", pad_edge=False, box=SIMPLE
-    )
-    for row in rows:
-        times = (
-            "–" if row[f"{k}_ms"] is None else f"{row[f'{k}_ms']:.1f}±{row[f'{k}_iqr_ms'] / 2:.1f}"
-            for k in ("forward", "backward")
-        )
-        memory = "–" if row["peak_mib"] is None else f"{row['peak_mib']:.0f}"
-        errors = ("–" if row[k] is None else f"{row[k]:.0e}" for k in ("value_error", "gradient_error"))
-        note = "unstable" if row["unstable"] else ""
-        table.add_row(row["kernel"], row["case"], row["backend"], *times, memory, *errors, note)
-    console = Console(width=max(Console().width, TABLE_WIDTH))
-    console.print(table)
-    gpu = f", {about['gpu']}" if about["gpu"] else ""
-    console.print(f"{about['cpu']}, {about['torch_threads']} threads{gpu}, load average {about['load_average']}")
-    console.print(
-        f"Median ± half the interquartile range; unstable: the range exceeds {UNSTABLE:.0%} of the median. Errors are"
-        f" against the float64 twin in a window of {WINDOW}² px (image: largest; gradient: relative norm); those of"
-        " the z-buffer are its depth's, in m, against numpy."
-    )

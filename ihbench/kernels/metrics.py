@@ -1,0 +1,261 @@
+"""The metrics: their times on a 512² frame beside other people's libraries, and their errors against the oracles.
+
+Errors are those of the mean over a smaller pair of images of the same kind, where the oracle takes seconds; LPIPS has
+no oracle but the package it calls. Libraries that are not installed have no row.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench.kernels.measuring import Row, interleave, peak_mib, summary
+from ihbench.metrics.cases import Case, hashed, person_case
+from ihbench.threads import single_threaded_libraries
+
+if TYPE_CHECKING:
+    from ihbench.metrics.evaluate import Preset
+
+SIZE = 512  # px; side of the timed frames
+ERROR_SIZE = 48, 40  # px; of the frames that an oracle looks at
+DTYPES = (np.uint8, np.float16, np.float32, np.float64)
+WHITE = (1.0, 1.0, 1.0)
+FIGURES = {"1/20": (0.55, 0.27), "1/10": (0.75, 0.4), "1/3": (1.0, 1.0)}  # share of the frame -> of height, width
+FRAME_REGIONS = ("full", "box", "body", "visible", "hidden", "never_seen")
+
+Pair = tuple[NDArray, NDArray]
+Metric = Callable[[NDArray, NDArray], float]
+
+
+def ssim_rows(repeats: int, size: int = SIZE) -> list[Row]:
+    """SSIM of a frame on one core: ours for every dtype, scikit-image, torchmetrics, kornia, our loss in torch."""
+    from ihbench.metrics.oracle import ssim_oracle
+    from ihbench.metrics.ssim import ssim
+
+    others: dict[str, tuple[type, Metric, str]] = {"torch loss f32": (np.float32, _ssim_torch, "mirror")}
+    for package, name, metric, border in (
+        ("skimage", "scikit-image f64", _scikit_image, "cropped"),
+        ("torchmetrics", "torchmetrics f32", _torchmetrics, "reflect"),
+        ("kornia", "kornia f32", _kornia, "reflect"),
+    ):
+        if find_spec(package) is not None:
+            others[name] = (np.float64 if name.endswith("f64") else np.float32, metric, border)
+    oracles: dict[Any, float] = {}
+
+    def oracle(small: Case, border: str) -> float:
+        key = small.name, border
+        if key not in oracles:
+            options: dict[str, Any] = {"crop": 5} if border == "cropped" else {"border": border}
+            oracles[key] = ssim_oracle(small.pred, small.truth, **options)
+        return oracles[key]
+
+    rows = []
+    for case, make in (("every pixel", _noise_case), ("a person", person_case)):
+        steps: dict[str, tuple[type, Metric, str]] = {_short(t): (t, ssim, "mirror") for t in DTYPES}
+        rows += _compared("ssim", case, size, make, steps | others, oracle, repeats)
+    return rows
+
+
+def flip_rows(repeats: int, size: int = SIZE) -> list[Row]:
+    """FLIP of a frame on one core: ours for every dtype, and NVIDIA's evaluator."""
+    from ihbench.metrics.flip import flip
+    from ihbench.metrics.flip_oracle import flip_oracle
+
+    steps: dict[str, tuple[type, Metric, str]] = {_short(t): (t, flip, "") for t in DTYPES}
+    if find_spec("flip_evaluator") is not None:
+        steps["flip-evaluator f32"] = (np.float32, _flip_evaluator, "")
+    oracle = lambda small, _: flip_oracle(small.pred, small.truth)  # noqa: E731
+    return _compared("flip", "a person", size, person_case, steps, oracle, repeats)
+
+
+def lpips_rows(repeats: int, size: int = SIZE) -> list[Row]:
+    """LPIPS of a frame through every trunk (with random weights, which cost the same): ours against the package."""
+    from ihbench.metrics import lpips
+    from ihbench.metrics.check import package_distance
+
+    rows = []
+    frame = person_case(size, size)
+    with lpips.random_networks() as networks:
+        for net, network in networks.items():
+            package = partial(package_distance, network.package, "[-1,1]")
+            ours = partial(lpips.lpips, net=net)
+            truth = package(frame.pred, frame.truth)
+            steps: dict[str, Metric] = {"ours": ours, "lpips package": package}
+            timings = interleave({k: partial(_timed, f, frame) for k, f in steps.items()}, min(repeats, 5), warm_up=1)
+            for name, metric in steps.items():
+                error = abs(metric(frame.pred, frame.truth) - truth)
+                memory = peak_mib(lambda f=metric: f(frame.pred, frame.truth))
+                rows.append(_row("lpips", f"{net}@{size}", name, timings[name], memory, error))
+    return rows
+
+
+def frame_rows(repeats: int, size: int = SIZE) -> list[Row]:
+    """PSNR and SSIM of a frame over six regions in one pass, on one core; and with FLIP.
+
+    The figure takes a twentieth of the frame, as a stand-in's person does, or more.
+    """
+    from ihbench.metrics.evaluate import evaluate
+    from ihbench.metrics.presets_oracle import preset_oracle
+
+    rows = []
+    for share, extent in FIGURES.items():
+        frame, small = _framed_person(extent, size, size), _framed_person(extent, *ERROR_SIZE)
+        steps, presets = {}, {"psnr+ssim": headline_with(("psnr", "ssim"))}
+        presets["psnr+ssim+flip"] = headline_with(("psnr", "ssim", "flip"))
+        for name, preset in presets.items():
+            score = lambda x, y, p=preset: evaluate(x, y, _six(frame), p)  # noqa: E731, B023
+            steps[name] = partial(_timed, score, frame)
+        with single_threaded_libraries():
+            timings = interleave(steps, repeats)
+        truth = preset_oracle("ihbench", small.pred, small.truth, _six(small), WHITE, lambda *_: 0.0)
+        for name, preset in presets.items():
+            found = evaluate(small.pred, small.truth, _six(small), preset)
+            error = max(abs(score.value - truth[i]) for i, score in found.items() if not np.isnan(score.value))
+            memory = peak_mib(lambda p=preset, f=frame: evaluate(f.pred, f.truth, _six(f), p))
+            rows.append(_row("frame", f"6 regions, {share}@{size}", name, timings[name], memory, error))
+    return rows
+
+
+def _framed_person(extent: tuple[float, float], height: int, width: int, dtype: type = np.float32) -> Case:
+    """The figure of `person_case` in the middle of a frame of which it takes this share of the height and width."""
+    inner = person_case(int(height * extent[0]), int(width * extent[1]), dtype)
+    top, left = (height - inner.truth.shape[0]) // 2, (width - inner.truth.shape[1]) // 2
+    area = np.s_[top : top + inner.truth.shape[0], left : left + inner.truth.shape[1]]
+    images = []
+    for image in (inner.pred, inner.truth):
+        whole = np.full((height, width, 3), 255 if dtype == np.uint8 else 1, dtype)
+        whole[area] = image
+        images.append(whole)
+    regions = {name: np.zeros((height, width), np.bool_) for name in inner.regions}
+    for name, mask in inner.regions.items():
+        regions[name][area] = mask
+    regions["full"][:] = True
+    return Case(f"framed {inner.name}", *images, regions)
+
+
+def _compared(
+    kernel: str,
+    case: str,
+    size: int,
+    make: Callable[..., Case],
+    steps: dict[str, tuple[type, Metric, str]],  # name -> dtype, metric, which oracle
+    oracle: Callable[[Case, str], float],
+    repeats: int,
+) -> list[Row]:
+    frames = {dtype: make(size, size, dtype) for dtype in {dtype for dtype, _, _ in steps.values()}}
+    with single_threaded_libraries(), _one_torch_thread():
+        timings = interleave({k: partial(_timed, f, frames[t]) for k, (t, f, _) in steps.items()}, repeats)
+        rows = []
+        for name, (dtype, metric, which) in steps.items():
+            frame, small = frames[dtype], make(*ERROR_SIZE, dtype)
+            error = abs(metric(small.pred, small.truth) - oracle(small, which))
+            memory = peak_mib(lambda f=metric, x=frame: f(x.pred, x.truth))
+            rows.append(_row(kernel, f"{case}@{size}", name, timings[name], memory, error))
+    return rows
+
+
+@contextmanager
+def _one_torch_thread() -> Iterator[None]:
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _timed(metric: Callable[[NDArray, NDArray], Any], frame: Case) -> tuple[float, None]:
+    start = time.perf_counter()
+    metric(frame.pred, frame.truth)
+    return (time.perf_counter() - start) * 1e3, None
+
+
+def _row(kernel: str, case: str, backend: str, samples: list, memory: float | None, error: float) -> Row:
+    return {
+        "kernel": kernel,
+        "case": case,
+        "backend": backend,
+        **summary(samples),
+        "peak_mib": memory,
+        "value_error": error,
+        "gradient_error": None,
+    }
+
+
+def _short(dtype: type) -> str:
+    return np.dtype(dtype).name.replace("float", "f").replace("uint", "u")
+
+
+def _noise_case(height: int, width: int, dtype: type) -> Case:
+    """Two unrelated textures: no window is equal in both."""
+    images: Iterator[NDArray] = (hashed(seed, height, width) for seed in (1, 2))
+    pred, truth = (image if dtype == np.uint8 else (image / 255).astype(dtype) for image in images)
+    return Case(f"noise {np.dtype(dtype).name}", pred, truth, {})
+
+
+def headline_with(metrics: tuple[str, ...]) -> Preset:
+    """The bench's own preset with some of its metrics."""
+    from ihbench.metrics.evaluate import find_preset
+
+    whole = find_preset("ihbench")
+    kept = [m for m in whole.measures if str(m.identity("full", WHITE)).split("/")[0] in metrics]
+    return replace(whole, measures=tuple(kept))
+
+
+def _six(frame: Case) -> dict[str, Any]:
+    return {name: frame.regions[name] for name in FRAME_REGIONS}
+
+
+# ----------------------------------------------------------------------------------------------------
+# Other libraries
+
+
+def _ssim_torch(pred: NDArray, truth: NDArray) -> float:
+    from ihbench.metrics.ssim_torch import ssim_map_torch
+
+    return float(ssim_map_torch(_channels_first(pred), _channels_first(truth)).mean())
+
+
+def _scikit_image(pred: NDArray, truth: NDArray) -> float:
+    from skimage.metrics import structural_similarity
+
+    value: Any = structural_similarity(
+        truth, pred, data_range=1.0, channel_axis=2, gaussian_weights=True, sigma=1.5, use_sample_covariance=False
+    )
+    return float(value)
+
+
+def _torchmetrics(pred: NDArray, truth: NDArray) -> float:
+    from torchmetrics.functional.image import structural_similarity_index_measure
+
+    value: Any = structural_similarity_index_measure(_channels_first(pred), _channels_first(truth), data_range=1.0)
+    return float(value)
+
+
+def _kornia(pred: NDArray, truth: NDArray) -> float:
+    import kornia
+
+    return float(kornia.metrics.ssim(_channels_first(pred), _channels_first(truth), 11, 1.0).mean())
+
+
+def _flip_evaluator(pred: NDArray, truth: NDArray) -> float:
+    import flip_evaluator
+
+    images = (np.ascontiguousarray(np.clip(image, 0, 1), np.float32) for image in (truth, pred))
+    return float(flip_evaluator.evaluate(*images, "LDR", applyMagma=False)[1])
+
+
+def _channels_first(image: NDArray) -> Any:
+    import torch
+
+    return torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None]

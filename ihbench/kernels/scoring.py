@@ -1,0 +1,94 @@
+"""Scoring a subject's test views as `ihbench score` does: reading, regions, metrics and writing, overlapped.
+
+On the stand-in of `zju_occ` at the profile `paper`, which is made first if no run has made it yet (about a minute,
+kept in the cache): 374 views of 512², read from 1024² JPEG and PNG files. LPIPS is left out.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from ihbench.kernels.measuring import Row, peak_mib, summary
+from ihbench.kernels.metrics import headline_with
+
+PROTOCOL, PROFILE = "zju_occ", "paper"
+VIEWS = 374
+CASES = {"psnr+ssim": ("psnr", "ssim"), "psnr+ssim+flip": ("psnr", "ssim", "flip")}
+
+
+def score_rows(repeats: int, views: int = VIEWS, profile: str = PROFILE) -> list[Row]:
+    """One row for each set of metrics: all views, predictions read from PNG files and written again as renders.
+
+    The predictions are the truth a pixel off. `repeats` above 3 are 3.
+    """
+    from ihbench.contact_sheet import write_png
+    from ihbench.data_source import locate
+    from ihbench.metrics.eight_bit import rounded
+    from ihbench.predictions import read_image
+    from ihbench.progress import Progress
+    from ihbench.protocol import load_protocol
+    from ihbench.scoring import Scorer
+    from ihbench.views import open_scene
+
+    protocol = load_protocol(PROTOCOL, profile)
+    source = locate(protocol, None, (protocol.standin_subjects[0],))
+    capture, body = source.open(source.scenes[0], None, Progress())
+    scene = open_scene(capture, protocol)
+    background = protocol.image.background
+    indices = range(min(views, len(scene.test_keys)))
+    rows = []
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        scene.train.preload()
+        for index in indices:
+            off = np.roll(scene.test[index].image, 1, axis=1)
+            write_png(folder / "in" / f"{index}.png", rounded(off))
+        for case, metrics in CASES.items():
+            samples = []
+
+            def score_all(scorer: Scorer) -> None:
+                def predict(loaded):
+                    return read_image(folder / "in" / f"{loaded.index}.png", background)
+
+                def write(loaded, images):
+                    write_png(folder / "out" / f"{loaded.index}.png", images["p"])
+
+                for _ in scorer.scored({"p": predict}, indices, after_each=write, threaded=True):
+                    pass
+
+            for k in range(min(repeats, 3)):
+                fresh = open_scene(capture, protocol)  # holds no view of the last pass
+                scorer = Scorer(fresh, *_prepared(scene, body), (headline_with(metrics),))
+                start = time.perf_counter()
+                if k == 0:
+                    memory = peak_mib(lambda s=scorer: score_all(s))
+                else:
+                    score_all(scorer)
+                samples.append(((time.perf_counter() - start) * 1e3, None))
+            rows.append(
+                {
+                    "kernel": "score",
+                    "case": f"{len(indices)} views@{protocol.image.size}",
+                    "backend": case,
+                    **summary(samples),
+                    "peak_mib": memory,
+                    "value_error": None,
+                    "gradient_error": None,
+                }
+            )
+    return rows
+
+
+def _prepared(scene, body):
+    from ihbench.body.uv import texel_table
+    from ihbench.regions import SurfaceMap
+    from ihbench.scoring import VISIBILITY_TEXELS
+    from ihbench.visibility import texel_visibility
+
+    texels = texel_table(body, VISIBILITY_TEXELS)
+    visibility = texel_visibility(scene.train, body, texels)
+    return SurfaceMap.build(body, texels, visibility), texels, visibility

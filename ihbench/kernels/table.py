@@ -1,0 +1,95 @@
+"""Work-precision of the bench's own kernels: milliseconds and error against the slow twin, for every back end.
+
+Behind `ihbench kernels`. A kernel is an entry of `KERNELS`: a function from the number of repetitions to table rows.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+
+from ihbench import machine
+from ihbench.errors import BadInput
+from ihbench.kernels.measuring import UNSTABLE, Row
+from ihbench.kernels.metrics import flip_rows, frame_rows, lpips_rows, ssim_rows
+from ihbench.kernels.scoring import score_rows
+from ihbench.kernels.splats import WINDOW, splat_rows
+from ihbench.kernels.zbuffers import zbuffer_rows
+
+REPEATS = 15
+TABLE_WIDTH = 118  # characters; a narrower terminal would cut the numbers
+
+
+def run_kernels(names: Sequence[str] | None = None, as_json: bool = False, repeats: int = REPEATS) -> list[Row]:
+    """Measure the kernels called `names` (all of them by default) and print the result; returns its rows.
+
+    Prints a table, or with `as_json` one JSON object {"machine": …, "rows": […]}. A row has kernel, case, backend,
+    the median and the interquartile range of the timings in ms (None where the kernel has no backward pass), the
+    memory the work needs beside its input in MiB, the errors against the twin, `unstable`, and `ratio`, its forward
+    time over that of the first back end of its case.
+
+    Raises BadInput for an unknown name or fewer than one repetition.
+    """
+    unknown = sorted(set(names or ()) - set(KERNELS))
+    if unknown:
+        raise BadInput(f"kernel {unknown[0]!r}: expected one of {', '.join(sorted(KERNELS))}")
+    if repeats < 1:
+        raise BadInput(f"kernel repetitions: expected at least 1, got {repeats}")
+    rows = [row for name in (names or KERNELS) for row in KERNELS[name](repeats)]
+    first: dict[tuple[str, str], float] = {}
+    for row in rows:
+        row["ratio"] = row["forward_ms"] / first.setdefault((row["kernel"], row["case"]), row["forward_ms"])
+    about = machine.identity()
+    if as_json:
+        print(json.dumps({"machine": about, "rows": rows}))
+    else:
+        _print_table(about, rows)
+    return rows
+
+
+KERNELS: dict[str, Callable[[int], list[Row]]] = {
+    "splat": splat_rows,
+    "zbuffer": zbuffer_rows,
+    "ssim": ssim_rows,
+    "flip": flip_rows,
+    "lpips": lpips_rows,
+    "frame": frame_rows,
+    "score": score_rows,
+}
+
+
+def _print_table(about: Row, rows: list[Row]) -> None:
+    from rich.box import SIMPLE
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(
+        *("kernel", "case", "back end", "fwd ms", "ratio", "bwd ms", "MiB", "error", "grad err", ""),
+        pad_edge=False,
+        box=SIMPLE,
+    )
+    for row in rows:
+        forward, backward = (
+            "–" if row[f"{k}_ms"] is None else f"{_digits(row[f'{k}_ms'])}±{_digits(row[f'{k}_iqr_ms'] / 2)}"
+            for k in ("forward", "backward")
+        )
+        memory = "–" if row["peak_mib"] is None else f"{row['peak_mib']:.0f}"
+        errors = ("–" if row[k] is None else f"{row[k]:.0e}" for k in ("value_error", "gradient_error"))
+        note = "unstable" if row["unstable"] else ""
+        of = row["kernel"], row["case"], row["backend"]
+        table.add_row(*of, forward, f"{row['ratio']:.2f}", backward, memory, *errors, note)
+    console = Console(width=max(Console().width, TABLE_WIDTH))
+    console.print(table)
+    gpu = f", {about['gpu']}" if about["gpu"] else ""
+    console.print(f"{about['cpu']}, {about['torch_threads']} threads{gpu}, load average {about['load_average']}")
+    console.print(
+        f"Median ± half the interquartile range; unstable: the range exceeds {UNSTABLE:.0%} of the median; ratio: of"
+        " the forward time to that of the case's first row. Errors of splats are against the float64 twin in a window"
+        f" of {WINDOW}² px (image: largest; gradient: relative norm), those of the z-buffer its depth's, in m, against"
+        " numpy, those of metrics against the float64 oracle on a small frame (LPIPS: against its package, random"
+        " trunk)."
+    )
+
+
+def _digits(ms: float) -> str:
+    return f"{ms:.1f}" if ms < 1000 else f"{ms:.0f}"
