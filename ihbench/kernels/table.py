@@ -85,9 +85,9 @@ def _print_table(about: Row, rows: list[Row]) -> None:
     console.print(
         f"Median ± half the interquartile range; unstable: the range exceeds {UNSTABLE:.0%} of the median; ratio: of"
         " the forward time to that of the case's first row. Errors of splats are against the float64 twin in a window"
-        f" of {WINDOW}² px (image: largest; gradient: relative norm), those of the z-buffer its depth's, in m, against"
-        " numpy, those of metrics against the float64 oracle on a small frame (LPIPS: against its package, random"
-        " trunk)."
+        f" of {WINDOW}² px (image: largest; gradient: relative norm), those of the z-buffer its depth's, in m,"
+        " against numpy, those of metrics against the float64 oracle on a small frame (LPIPS: against its package,"
+        " random trunk)."
     )
 
 
