@@ -14,32 +14,28 @@ from __future__ import annotations
 
 import hashlib
 import io
-import pickle
 import re
-import warnings
-import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ihbench import atomic
-from ihbench.body import Body, from_zju_root, load_body, zju_root
+from ihbench.body import Body, from_zju_root, zju_root
 from ihbench.camera import Camera
+from ihbench.datasets.capture_folder import CaptureFolder
+from ihbench.datasets.overlap import share_inside
+from ihbench.datasets.pickles import write_object
+from ihbench.datasets.pictures import decoded, encoded, opened
 from ihbench.errors import BadInput
 from ihbench.registry import nearest
 from ihbench.safe_pickle import load_npy
 from ihbench.scene import BodyPose
 
-if TYPE_CHECKING:
-    from PIL import Image
-
 FOLDER_PREFIX = "CoreView_"
-STANDIN_FILE = "STANDIN.json"  # beside the subjects; only in copies that ihbench made up
 FITS = ("new_params", "params")  # the newer one first: HumanNeRF and OccNeRF use it
 VERTICES = {"new_params": "new_vertices", "params": "vertices"}
 SILHOUETTES = {"mask": ("mask",), "mask_cihp": ("mask_cihp",), "union": ("mask", "mask_cihp")}
@@ -87,23 +83,13 @@ class ZjuMocap:
         return ZjuCapture(self._folders[subject], body)
 
 
-class ZjuCapture:
+class ZjuCapture(CaptureFolder):
     """One subject, read lazily; see `ihbench.scene.Capture`. Keeps no images."""
 
     dataset = "zju_mocap"
 
     def __init__(self, folder: Path, body: Body | None = None):
-        self.folder = folder
-        self.name = folder.name.removeprefix(FOLDER_PREFIX)
-        self._mark = _standin_mark(folder)
-        self.standin = f"stand-in v{self._mark['version']} seed {self._mark['seed']}" if self._mark else ""
-        self.body = "procedural" if self.standin else "smpl"
-        if body is not None and body.name != self.body:
-            raise BadInput(
-                f"{folder}: its parameters belong to the {self.body} body, but the {body.name} body was given; "
-                f"{'give no body file' if self.standin else 'give an SMPL file (--body or IHBENCH_BODY)'}"
-            )
-        self._given_body = body
+        super().__init__(folder, folder.name.removeprefix(FOLDER_PREFIX), body)
         self._annots = read_annots(folder / "annots.npy")
         self.fit = next((name for name in FITS if (folder / name).is_dir()), None)
         if self.fit is None:
@@ -117,7 +103,7 @@ class ZjuCapture:
 
     def camera(self, camera: int) -> Camera:
         """The calibrated view with its lens distortion; its size comes from the header of one of its images."""
-        self._check_index(camera, 0)
+        self.check_index(camera, 0)
         width, height = self._image_size(camera)
         K, D, R, T = (self._annots.cameras[key][camera] for key in CAMERA_SHAPES)
         return Camera.from_opencv(K, R, T / 1000, width, height, D)
@@ -126,7 +112,7 @@ class ZjuCapture:
         """The frame's SMPL parameters in the standard root convention."""
         path = self.params_path(frame)
         poses, shapes, Rh, Th = read_params(path)
-        body = self._smpl_body
+        body = self.model
         try:
             return from_zju_root(poses, shapes, Rh, Th, body)
         except BadInput as error:
@@ -176,45 +162,20 @@ class ZjuCapture:
 
     def number(self, frame: int) -> int:
         """The number that the frame's parameter and vertex files carry; 313 and 315 count from 1."""
-        self._check_index(0, frame)
+        self.check_index(0, frame)
         return _frame_number(self._annots.image_paths[frame][0], self.folder)
 
     def image_path(self, camera: int, frame: int) -> Path:
-        self._check_index(camera, frame)
+        self.check_index(camera, frame)
         return self.folder / self._annots.image_paths[frame][camera]
 
     def mask_path(self, camera: int, frame: int, kind: str = "mask") -> Path:
-        self._check_index(camera, frame)
+        self.check_index(camera, frame)
         return self.folder / kind / PurePosixPath(self._annots.image_paths[frame][camera]).with_suffix(".png")
 
     def params_path(self, frame: int) -> Path:
         assert self.fit is not None
         return self.folder / self.fit / f"{self.number(frame)}.npy"
-
-    @cached_property
-    def _smpl_body(self) -> Body:
-        body = self._given_body
-        if body is None and not self._mark:
-            raise BadInput(
-                f"{self.folder}: its poses need the SMPL model, which ihbench may not ship; "
-                f"give your SMPL file with --body FILE or IHBENCH_BODY"
-            )
-        body = body or load_body()
-        if self._mark and self._mark["body_sha"] != body.content_sha():
-            raise BadInput(
-                f"{self.folder}: made with another version of the procedural body than this ihbench has; "
-                f"remove the stand-in and make it anew"
-            )
-        return body
-
-    def _check_index(self, camera: int, frame: int) -> None:
-        if not 0 <= camera < len(self.camera_ids):
-            n = len(self.camera_ids)
-            raise BadInput(f"{self.folder}: no camera {camera}; it has {n} cameras, 0 to {n - 1}")
-        if not 0 <= frame < self.n_frames:
-            raise BadInput(
-                f"{self.folder}: no frame {frame}; it has {self.n_frames} frames, 0 to {self.n_frames - 1}"
-            )
 
     def _image_size(self, camera: int) -> tuple[int, int]:
         """(width, height) px of the camera's first image on disk."""
@@ -224,16 +185,16 @@ class ZjuCapture:
             if path is None:
                 folder = self.image_path(camera, 0).parent
                 state = "no image in it" if folder.is_dir() else "no such folder"
-                raise BadInput(f"{folder}: {state}; expected the images of camera {camera}{self._standin_hint()}")
-            with _opened(path) as picture:
+                raise BadInput(f"{folder}: {state}; expected the images of camera {camera}{self.standin_hint}")
+            with opened(path) as picture:
                 self._sizes[camera] = picture.size
         return self._sizes[camera]
 
     def _read_picture(self, path: Path, mode: str | None = None) -> NDArray[np.uint8]:
         if not path.is_file():
             missing = "file" if path.parent.is_dir() else f"file, nor its folder {path.parent.name}"
-            raise BadInput(f"{path}: no such {missing}; annots.npy lists it{self._standin_hint()}")
-        return _decoded(path, mode)
+            raise BadInput(f"{path}: no such {missing}; annots.npy lists it{self.standin_hint}")
+        return decoded(path, mode)
 
     def _check_size(self, path: Path, picture: NDArray, camera: int) -> None:
         width, height = self._image_size(camera)
@@ -242,9 +203,6 @@ class ZjuCapture:
                 f"{path}: {picture.shape[1]}×{picture.shape[0]} px, but the camera's images are {width}×{height} px; "
                 f"expected one size for a camera's images and masks"
             )
-
-    def _standin_hint(self) -> str:
-        return "; a stand-in holds only the images it was asked for, ask for this one too" if self.standin else ""
 
 
 @dataclass(frozen=True)
@@ -366,39 +324,6 @@ def _frame_number(image: str, folder: Path) -> int:
     return int(number)
 
 
-def _opened(path: Path) -> Image.Image:
-    from PIL import Image
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
-            return Image.open(path)
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
-        raise BadInput(f"{path}: not a readable image ({_one_line(error)}); copy the file again") from error
-
-
-def _decoded(path: Path, mode: str | None) -> NDArray[np.uint8]:
-    with _opened(path) as picture:
-        try:
-            picture.load()
-        except (OSError, SyntaxError, ValueError, zlib.error) as error:
-            raise BadInput(f"{path}: damaged or cut short ({_one_line(error)}); copy the file again") from error
-        if mode is None and picture.mode in ("LA", "RGBA"):  # an opaque alpha channel is no label
-            mode = picture.mode.removesuffix("A")
-        return np.array(picture if mode is None else picture.convert(mode))
-
-
-def _standin_mark(folder: Path) -> dict[str, Any]:
-    """What STANDIN.json beside the subject says: version, seed and body_sha; empty for real data."""
-    path = folder.parent / STANDIN_FILE
-    if not path.is_file():
-        return {}
-    mark = atomic.read_json(path)
-    if not isinstance(mark, dict) or not {"version", "seed", "body_sha"} <= mark.keys():
-        raise BadInput(f"{path}: expected version, seed and body_sha of the stand-in; make the stand-in anew")
-    return mark
-
-
 def _where_else(root: Path) -> str:
     below = next((path.parent for path in sorted(root.glob(f"*/{FOLDER_PREFIX}*"))), None)
     if below is not None:
@@ -420,10 +345,6 @@ def _described(value: object) -> str:
 
 def _shape_of(array: NDArray) -> str:
     return f"a {array.dtype} array of shape {list(array.shape)}"
-
-
-def _one_line(error: object) -> str:
-    return " ".join(str(error).split())[:120]
 
 
 # ----------------------------------------------------------------------------------------------- check
@@ -515,7 +436,7 @@ def _sample(
                 continue
             decoded += 1
             grown = binary_dilation(silhouette, iterations=max(1, silhouette.shape[1] // 100))
-            inside.append(_share_inside(points, np.asarray(grown, bool)))
+            inside.append(share_inside(points, np.asarray(grown, bool)))
     found["sampled_images"] = decoded
     found["image_size"] = sorted([list(size) for size in sizes])
     if inside:
@@ -524,15 +445,6 @@ def _sample(
             problems.append(
                 f"only {share:.0%} of the body's vertices project into the silhouettes; expected over 95 %"
             )
-
-
-def _share_inside(points: NDArray[np.float64], region: NDArray[np.bool_]) -> float:
-    """The share of projected points [V, 3] (x px, y px, depth m) that fall on the region [H, W]."""
-    height, width = region.shape
-    column, row = np.floor(points[:, 0]), np.floor(points[:, 1])
-    seen = (points[:, 2] > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    hits = region[row[seen].astype(int), column[seen].astype(int)].sum()
-    return float(hits) / len(points)
 
 
 # ----------------------------------------------------------------------------------------------- write
@@ -554,7 +466,7 @@ def write_annots(folder: Path, cameras: Sequence[Camera], image_paths: Sequence[
         "R": [camera.R.copy() for camera in cameras],
         "T": [1000 * camera.t.reshape(3, 1) for camera in cameras],
     }
-    _write_object(folder / "annots.npy", {"cams": cams, "ims": [{"ims": list(frame)} for frame in image_paths]})
+    write_object(folder / "annots.npy", {"cams": cams, "ims": [{"ims": list(frame)} for frame in image_paths]})
 
 
 def write_frame(
@@ -566,11 +478,11 @@ def write_frame(
 ) -> None:
     """The picture files of one camera at one frame: JPEG of quality 95, masks as 8-bit PNG. None is not written."""
     if image is not None:
-        atomic.write_bytes(folder / image_path, _encoded(image, "JPEG", quality=JPEG_QUALITY), durable=False)
+        atomic.write_bytes(folder / image_path, encoded(image, "JPEG", quality=JPEG_QUALITY), durable=False)
     for kind, labels in (("mask", mask), ("mask_cihp", mask_cihp)):
         if labels is not None:
             path = folder / kind / PurePosixPath(image_path).with_suffix(".png")
-            atomic.write_bytes(path, _encoded(labels.astype(np.uint8), "PNG", compress_level=3), durable=False)
+            atomic.write_bytes(path, encoded(labels.astype(np.uint8), "PNG", compress_level=3), durable=False)
 
 
 def write_params(folder: Path, number: int, body_pose: BodyPose, body: Body, fit: str = "new_params") -> None:
@@ -579,7 +491,7 @@ def write_params(folder: Path, number: int, body_pose: BodyPose, body: Body, fit
     poses = body_pose.pose.copy()
     poses[0] = 0
     row = {"poses": poses.reshape(1, 72), "shapes": body_pose.betas[None].copy(), "Rh": Rh[None], "Th": Th[None]}
-    _write_object(folder / fit / f"{number}.npy", row)
+    write_object(folder / fit / f"{number}.npy", row)
 
 
 def write_vertices(folder: Path, number: int, vertices: NDArray[np.floating], fit: str = "new_params") -> None:
@@ -587,21 +499,3 @@ def write_vertices(folder: Path, number: int, vertices: NDArray[np.floating], fi
     buffer = io.BytesIO()
     np.save(buffer, np.asarray(vertices, np.float32))
     atomic.write_bytes(folder / VERTICES[fit] / f"{number}.npy", buffer.getvalue(), durable=False)
-
-
-def _encoded(picture: NDArray[np.uint8], kind: str, **options: int) -> bytes:
-    from PIL import Image
-
-    buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, kind, **options)
-    return buffer.getvalue()
-
-
-def _write_object(path: Path, value: dict[str, Any]) -> None:
-    """A dictionary as np.save would write it, but with numpy 1's module names, which numpy 1 and 2 both read."""
-    buffer = io.BytesIO()
-    np.lib.format.write_array_header_1_0(buffer, {"descr": "|O", "fortran_order": False, "shape": ()})
-    # protocol 3 spells module names as plain lines without lengths, so they can be replaced in place
-    pickled = pickle.dumps(np.array(value, dtype=object), protocol=3)
-    buffer.write(pickled.replace(b"cnumpy._core.multiarray\n", b"cnumpy.core.multiarray\n"))
-    atomic.write_bytes(path, buffer.getvalue(), durable=False)

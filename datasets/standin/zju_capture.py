@@ -19,6 +19,7 @@ from ihbench.datasets.standin.photograph import photograph
 from ihbench.datasets.standin.rig import N_CAMERAS
 from ihbench.datasets.standin.studio import empty_studio
 from ihbench.datasets.standin.subject import Subject
+from ihbench.datasets.standin_mark import STANDIN_FILE
 from ihbench.errors import BadInput
 from ihbench.progress import Progress
 
@@ -98,7 +99,7 @@ def _claim(root: Path, seed: int, body: Body) -> None:
         "body": body.name,
         "body_sha": body.content_sha(),
     }
-    path = root / zju_mocap.STANDIN_FILE
+    path = root / STANDIN_FILE
     if path.is_file():
         found = atomic.read_json(path)
         if found != mark:

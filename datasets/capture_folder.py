@@ -1,0 +1,61 @@
+"""What captures of every format share: a name, whether they are a stand-in, the body their poses belong to."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from pathlib import Path
+
+from ihbench.body import Body, load_body
+from ihbench.datasets.standin_mark import standin_mark
+from ihbench.errors import BadInput
+
+
+class CaptureFolder:
+    """One subject's folder. A format adds what `ihbench.scene.Capture` asks for."""
+
+    n_frames: int
+    camera_ids: tuple[str, ...]
+
+    def __init__(self, folder: Path, name: str, body: Body | None = None, root: Path | None = None):
+        """`root` holds the stand-in's mark, the folder's parent by default. Raises `BadInput` for a body of another
+        kind than the capture's."""
+        self.folder, self.name = folder, name
+        self._mark = standin_mark(root or folder.parent)
+        self.standin = f"stand-in v{self._mark['version']} seed {self._mark['seed']}" if self._mark else ""
+        self.body = "procedural" if self.standin else "smpl"
+        if body is not None and body.name != self.body:
+            raise BadInput(
+                f"{folder}: its parameters belong to the {self.body} body, but the {body.name} body was given; "
+                f"{'give no body file' if self.standin else 'give an SMPL file (--body or IHBENCH_BODY)'}"
+            )
+        self._given_body = body
+
+    @cached_property
+    def model(self) -> Body:
+        """The body model of the capture's poses. Raises `BadInput` when it is needed and was not given."""
+        if self._given_body is None and not self._mark:
+            raise BadInput(
+                f"{self.folder}: its poses need the SMPL model, which ihbench may not ship; "
+                f"give your SMPL file with --body FILE or IHBENCH_BODY"
+            )
+        body = self._given_body or load_body()
+        if self._mark and self._mark["body_sha"] != body.content_sha():
+            raise BadInput(
+                f"{self.folder}: made with another version of the procedural body than this ihbench has; "
+                f"remove the stand-in and make it anew"
+            )
+        return body
+
+    def check_index(self, camera: int, frame: int) -> None:
+        """Raise `BadInput` for a camera or frame that the capture does not have."""
+        if not 0 <= camera < len(self.camera_ids):
+            n = len(self.camera_ids)
+            raise BadInput(f"{self.folder}: no camera {camera}; it has {n} cameras, 0 to {n - 1}")
+        if not 0 <= frame < self.n_frames:
+            raise BadInput(
+                f"{self.folder}: no frame {frame}; it has {self.n_frames} frames, 0 to {self.n_frames - 1}"
+            )
+
+    @property
+    def standin_hint(self) -> str:
+        return "; a stand-in holds only the images it was asked for, ask for this one too" if self.standin else ""
