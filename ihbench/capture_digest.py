@@ -15,11 +15,8 @@ def capture_digest(capture: Capture, protocol: Protocol) -> str:
     digest = hashlib.sha256()
     n_frames = capture.n_frames
     trained = [(protocol.train_camera, frame) for frame in protocol.training_frames(capture.name, n_frames)]
-    tested = [
-        (camera, frame)
-        for camera in protocol.testing_cameras(len(capture.camera_ids))
-        for frame in protocol.testing_frames(capture.name, n_frames)
-    ]
+    n_cameras = len(capture.camera_ids)
+    tested = [(camera, frame) for camera, frame, _ in protocol.test_views(capture.name, n_frames, n_cameras)]
     views = [(camera, frame) for camera, frame in trained + tested if frame < n_frames]
     for index in dict.fromkeys(camera for camera, _ in views):
         camera = capture.camera(index)

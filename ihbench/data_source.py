@@ -116,10 +116,12 @@ def open_capture(dataset: str, root: Path, scene: str, body: Path | None) -> tup
 def wanted_frames(protocol: Protocol, standin: type) -> dict[int, list[int]]:
     """Camera index -> frames that a protocol reads of every stand-in subject."""
     n_frames, n_cameras = standin.n_frames, standin.n_cameras
-    wanted = {protocol.train_camera: protocol.training_frames("", n_frames)}
-    for camera in protocol.testing_cameras(n_cameras):
-        wanted[camera] = sorted({*wanted.get(camera, []), *protocol.testing_frames("", n_frames)})
-    return wanted
+    wanted: dict[int, set[int]] = {protocol.train_camera: set()}
+    for subject in standin.subjects(1):  # all of a cast have the same frames
+        wanted[protocol.train_camera] |= set(protocol.training_frames(subject, n_frames))
+        for camera, frame, _ in protocol.test_views(subject, n_frames, n_cameras):
+            wanted.setdefault(camera, set()).add(frame)
+    return {camera: sorted(frames) for camera, frames in wanted.items()}
 
 
 def _chosen(scenes: tuple[str, ...], known: list[str], found: list[str], where: str) -> tuple[str, ...]:

@@ -14,6 +14,9 @@ from ihbench.protocol import OcclusionRule, Protocol
 from ihbench.scene import Capture
 
 
+Mask = NDArray[np.bool_]
+
+
 @dataclass(frozen=True)
 class OcclusionRequest:
     subject: str
@@ -22,30 +25,64 @@ class OcclusionRequest:
     covered: Sequence[bool]  # which of them the occluder covers
     width: int  # px, original image
     height: int
-    silhouette: Callable[[int], NDArray[np.bool_]]  # raw frame number -> [H, W], original image
+    silhouette: Callable[[int], Mask]  # raw frame number -> [H, W], original image
+    body_mask: Callable[[int], Mask]  # raw frame number -> [H, W] the projected body, original image
+
+    @property
+    def covered_frames(self) -> list[int]:
+        return [frame for frame, covered in zip(self.frames, self.covered, strict=True) if covered]
 
 
 @dataclass(frozen=True)
 class Occlusion:
-    """A rule's answer: the image columns it hides in every covered frame, and what to write into the run record."""
+    """A rule's answer: the pixels it hides in each covered frame, and what to write into the run record."""
 
     rule: str
-    columns: NDArray[np.bool_]  # [W] original image
+    hidden: Callable[[int], Mask]  # raw frame number -> [H, W], original image; not to be written to
     record: dict[str, Any]
-
-    def hidden(self, height: int) -> NDArray[np.bool_]:
-        """[H, W] pixels hidden in a covered frame."""
-        return np.broadcast_to(self.columns, (height, len(self.columns)))
+    hides_nothing: bool = False  # in any frame
 
 
-def apply_rule(protocol: Protocol, capture: Capture) -> tuple[Occlusion, list[int], list[bool]]:
-    """(occlusion, training frames, covered flags) of one capture under a protocol."""
+@dataclass(frozen=True)
+class OcclusionPlan:
+    """A protocol's occlusion of one capture."""
+
+    occlusion: Occlusion
+    frames: tuple[int, ...]  # training frames
+    covered: tuple[bool, ...]
+    silhouette: Callable[[int], Mask]  # raw frame number -> [H, W] of the training camera, original image
+
+    def hidden_share(self, frames: Sequence[int] | None = None) -> float:
+        """Share of the pooled person pixels of the covered training frames that is hidden, original pixels; over some
+        of the training frames where they are named."""
+        chosen = self.frames if frames is None else frames
+        person = hidden = 0
+        for frame, covered in zip(self.frames, self.covered, strict=True):
+            if covered and frame in chosen:
+                silhouette = self.silhouette(frame)
+                person += int(silhouette.sum())
+                hidden += int((silhouette & self.occlusion.hidden(frame)).sum())
+        return hidden / person if person else 0.0
+
+
+def apply_rule(protocol: Protocol, capture: Capture) -> OcclusionPlan:
+    """What a protocol hides of one capture. Raises `BadInput` where the rule does not fit the data."""
     frames = protocol.training_frames(capture.name, capture.n_frames)
     covered = protocol.covered(capture.name, frames, capture.n_frames)
     camera = capture.camera(protocol.train_camera)
     rule = protocol.occlusion.rule
     if rule == "fixed-strip" and capture.name not in protocol.occlusion.strips:
         rule = protocol.occlusion.unlisted
+
+    def silhouette(frame: int) -> Mask:
+        return capture.silhouette(protocol.train_camera, frame, protocol.silhouette)
+
+    def body_mask(frame: int) -> Mask:
+        from ihbench.render.zbuffer import rasterize
+
+        points = camera.project(capture.model.pose(capture.body_pose(frame)))
+        return rasterize(points, capture.model.faces, camera.height, camera.width).mask
+
     request = OcclusionRequest(
         subject=capture.name,
         rule=protocol.occlusion,
@@ -53,6 +90,8 @@ def apply_rule(protocol: Protocol, capture: Capture) -> tuple[Occlusion, list[in
         covered=covered,
         width=camera.width,
         height=camera.height,
-        silhouette=lambda frame: capture.silhouette(protocol.train_camera, frame, protocol.silhouette),
+        silhouette=silhouette,
+        body_mask=body_mask,
     )
-    return registry.load("occlusion", rule)(request), frames, covered
+    occlusion = registry.load("occlusion", rule)(request)
+    return OcclusionPlan(occlusion, tuple(frames), tuple(covered), silhouette)

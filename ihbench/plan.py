@@ -16,7 +16,7 @@ from ihbench.atomic import read_json
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera
 from ihbench.errors import BadInput
-from ihbench.occlusion import Occlusion, apply_rule
+from ihbench.occlusion import OcclusionPlan, apply_rule
 from ihbench.protocol import Protocol
 from ihbench.scene import BodyPose, Capture, MaskState
 from ihbench.visibility import Visibility, texel_visibility
@@ -71,30 +71,25 @@ def measure_scene(capture: Capture, protocol: Protocol, body: Body) -> SceneMeas
     """Measure one capture under a protocol. Reads masks of at most `MEASURE_VIEWS` training views, no images."""
     from ihbench.body.uv import texel_table
 
-    occlusion, frames, covered = apply_rule(protocol, capture)
+    hiding = apply_rule(protocol, capture)
+    frames = hiding.frames
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(MEASURE_VIEWS, len(frames))).round().astype(int))
-    views = [_mask_view(capture, protocol, occlusion, frames[k], covered[k]) for k in chosen]
-    person = hidden = 0
-    for k in chosen:
-        if covered[k]:
-            silhouette = capture.silhouette(protocol.train_camera, frames[k], protocol.silhouette)
-            person += int(silhouette.sum())
-            hidden += int(silhouette[:, occlusion.columns].sum())
+    views = [_mask_view(capture, protocol, hiding, k) for k in chosen]
     texels = texel_table(body, TEXELS)
     seen = texel_visibility(views, body, texels)
     poses = np.stack([capture.body_pose(frame).pose for frame in frames])
     camera = views[0].camera
     depth = float(np.median([camera.to_camera(body.posed_joints(view.body_pose))[:, 2].mean() for view in views]))
-    focal = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1])) * protocol.image.size / camera.width
+    focal = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1])) 
+    focal *= protocol.image.size / max(camera.width, camera.height)
     corners = body.pose(views[0].body_pose)[body.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
     filled = len(texels.face) / TEXELS**2
     return SceneMeasure(
         training_views=len(frames),
-        covered_views=sum(covered) if occlusion.columns.any() else 0,
-        test_views=len(protocol.testing_cameras(len(capture.camera_ids)))
-        * len(protocol.testing_frames(capture.name, capture.n_frames)),
-        hidden_share=hidden / person if person else 0.0,
+        covered_views=0 if hiding.occlusion.hides_nothing else sum(hiding.covered),
+        test_views=len(protocol.test_views(capture.name, capture.n_frames, len(capture.camera_ids))),
+        hidden_share=hiding.hidden_share([frames[k] for k in chosen]),
         visible_texels=_share(seen, "visible"),
         hidden_texels=_share(seen, "hidden"),
         never_seen_texels=_share(seen, "never_seen"),
@@ -102,7 +97,7 @@ def measure_scene(capture: Capture, protocol: Protocol, body: Body) -> SceneMeas
         turn_deg=_turn(poses[:, 0]),
         pixel_mm=1000 * depth / focal,
         surface_mm=1000 * float(np.sqrt(area / filled)),
-        occlusion={"rule": occlusion.rule, **occlusion.record},
+        occlusion={"rule": hiding.occlusion.rule, **hiding.occlusion.record},
     )
 
 
@@ -120,11 +115,11 @@ def _share(seen: Visibility, what: str) -> float:
     return float(getattr(seen, what).mean())
 
 
-def _mask_view(capture: Capture, protocol: Protocol, occlusion: Occlusion, frame: int, covered: bool) -> _MaskView:
-    silhouette = capture.silhouette(protocol.train_camera, frame, protocol.silhouette)
-    state = np.where(silhouette, MaskState.PERSON, MaskState.BACKGROUND).astype(np.uint8)
-    if covered:
-        state[occlusion.hidden(len(state))] = MaskState.UNKNOWN
+def _mask_view(capture: Capture, protocol: Protocol, hiding: OcclusionPlan, k: int) -> _MaskView:
+    frame = hiding.frames[k]
+    state = np.where(hiding.silhouette(frame), MaskState.PERSON, MaskState.BACKGROUND).astype(np.uint8)
+    if hiding.covered[k]:
+        state[hiding.occlusion.hidden(frame)] = MaskState.UNKNOWN
     camera = capture.camera(protocol.train_camera)
     step = max(1, camera.width // MEASURE_SIZE)
     state = np.ascontiguousarray(state[step // 2 :: step, step // 2 :: step])

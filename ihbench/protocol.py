@@ -38,13 +38,18 @@ class Span:
 
 @dataclass(frozen=True)
 class ImageRule:
-    size: int  # px, square
+    size: int  # px, the longer side; the aspect is the original's
     background: tuple[float, float, float]
     undistort: bool
     edge: str  # hard | soft
     resample_image: str
     resample_mask: str
     to_8bit: str  # truncate | round
+
+    def extent(self, width: int, height: int) -> tuple[int, int]:
+        """(width, height) px of the protocol's image of an original of this width and height."""
+        scale = self.size / max(width, height)
+        return max(1, round(width * scale)), max(1, round(height * scale))
 
 
 @dataclass(frozen=True)
@@ -56,6 +61,18 @@ class OcclusionRule:
     covers_fraction: float
     covers_of: str  # sampled | raw
     strips: dict[str, tuple[int, int]]  # subject -> (mid, width)
+    seed: int = 0  # of rules that draw something
+
+
+@dataclass(frozen=True)
+class TestGroup:
+    """Further test views, scored apart from the protocol's own."""
+
+    __test__ = False
+
+    name: str  # what a table calls it, for example "train = test"
+    cameras: Span
+    frames: Span
 
 
 @dataclass(frozen=True)
@@ -78,6 +95,8 @@ class Protocol:
     test_cameras: Span
     test_except_train: bool
     test_frames: Span
+    spans: dict[str, tuple[Span, Span]]  # subject -> training and test frames, where they are its own
+    also: tuple[TestGroup, ...]
     occlusion: OcclusionRule
     image: ImageRule
     regions: tuple[str, ...]
@@ -96,15 +115,54 @@ class Protocol:
         words = {k: v for k, v in self.content.items() if k not in ("title", "reason", "source")}
         return hashlib.sha256(json.dumps(words, sort_keys=True).encode()).hexdigest()[:16]
 
-    def with_occlusion(self, rule: str) -> Protocol:
-        """The same protocol under another occlusion rule; its digest differs, so numbers never mix."""
-        content = {**self.content, "occlusion": {**self.content["occlusion"], "rule": rule, "unlisted": rule}}
-        replaced = _build(content, self.profile)
-        return replace(replaced, version=f"{self.version}+occlusion={rule}")
+    def with_occlusion(
+        self, rule: str | None = None, fraction: float | None = None, covers: float | None = None
+    ) -> Protocol:
+        """The same protocol under another occlusion; its digest differs, so numbers never mix.
+
+        `fraction` is what the rule aims at, `covers` the share of the training frames that are covered. Published
+        strips have no fraction: asked for one, `fixed-strip` becomes the rule for subjects without a strip. Raises
+        `BadInput` for shares outside [0, 1].
+        """
+        for name, share in (("fraction", fraction), ("covers", covers)):
+            if share is not None and not 0 <= share <= 1:
+                raise BadInput(f"--occlusion.{name} {share:g}: expected a share from 0 to 1")
+        occlusion = dict(self.content["occlusion"])
+        if fraction is not None and rule is None and occlusion["rule"] == "fixed-strip":
+            rule = occlusion["unlisted"]
+        changed = {"rule": rule, "fraction": fraction, "covers": covers}
+        if rule is not None:
+            occlusion |= {"rule": rule, "unlisted": rule}
+        if fraction is not None:
+            occlusion["fraction"] = float(fraction)
+        if covers is not None:
+            occlusion["covers"] = {**occlusion["covers"], "fraction": float(covers)}
+        told = ",".join(
+            str(value) if key == "rule" else f"{key}={value:g}" for key, value in changed.items() if value is not None
+        )
+        replaced = _build({**self.content, "occlusion": occlusion}, self.profile)
+        return replace(replaced, version=f"{self.version}+occlusion={told}") if told else self
+
+    def with_frames(self, train: str | None = None, test: str | None = None) -> Protocol:
+        """The same protocol with other frames, each "START:STOP:STEP" as in a Python slice; its digest differs.
+
+        Frames that are both trained on and tested stay in both: the caller's choice. Raises `BadInput` for anything
+        else than such a slice.
+        """
+        content, version = {**self.content}, self.version
+        for part, text in (("train", train), ("test", test)):
+            if text is not None:
+                content[part] = {**content[part], "frames": _slice(text, f"--{part}-frames")}
+                version += f"+{part}={text}"
+        if version == self.version:
+            return self
+        content["subjects"] = {k: v for k, v in content["subjects"].items() if k != "spans"}
+        return replace(_build(content, self.profile), version=version)
 
     def training_frames(self, subject: str, n_frames: int) -> list[int]:
         """Raw frame numbers of the training images."""
-        return list(self.train_frames.indices(self.max_frames.get(subject, n_frames)))
+        span = self.spans[subject][0] if subject in self.spans else self.train_frames
+        return list(span.indices(self.max_frames.get(subject, n_frames)))
 
     def covered(self, subject: str, frames: list[int], n_frames: int) -> list[bool]:
         """For each training frame, whether the occluder covers it.
@@ -124,7 +182,21 @@ class Protocol:
         return [c for c in cameras if not (self.test_except_train and c == self.train_camera)]
 
     def testing_frames(self, subject: str, n_frames: int) -> list[int]:
-        return list(self.test_frames.indices(self.max_frames.get(subject, n_frames)))
+        span = self.spans[subject][1] if subject in self.spans else self.test_frames
+        return list(span.indices(self.max_frames.get(subject, n_frames)))
+
+    def test_views(self, subject: str, n_frames: int, n_cameras: int) -> list[tuple[int, int, str]]:
+        """(camera, frame, group) of every test view, in order; the group of the protocol's own is ""."""
+        views = [
+            (camera, frame, "")
+            for camera in self.testing_cameras(n_cameras)
+            for frame in self.testing_frames(subject, n_frames)
+        ]
+        limit = self.max_frames.get(subject, n_frames)
+        for group in self.also:
+            cameras = [c for c in group.cameras.indices(n_cameras) if c < n_cameras]
+            views += [(camera, frame, group.name) for camera in cameras for frame in group.frames.indices(limit)]
+        return views
 
 
 def load_protocol(name: str, profile: str = "quick") -> Protocol:
@@ -182,6 +254,32 @@ def _one_of(value: str, known: tuple[str, ...], what: str) -> str:
     return value
 
 
+def _slice(text: str, flag: str) -> dict[str, Any]:
+    """A span's table from "0:500:5", "0::2" or "100:"."""
+    parts = text.split(":")
+    try:
+        start, stop, step = (int(part) if part else None for part in [*parts, "", ""][:3])
+    except ValueError:
+        start = stop = step = -1
+    if len(parts) not in (2, 3) or (start or 0) < 0 or (step is not None and step < 1):
+        raise BadInput(f"{flag} {text}: expected START:STOP:STEP with numbers from 0, for example 0:500:5")
+    if stop is not None and stop <= (start or 0):
+        raise BadInput(f"{flag} {text}: expected a stop above the start")
+    return {"start": start or 0, "stop": "max_frames" if stop is None else stop, "step": step or 1}
+
+
+def _spans(table: dict[str, Any]) -> dict[str, tuple[Span, Span]]:
+    """Per subject [start, stop, step] of its training and test frames."""
+    found = {}
+    for subject, own in table.items():
+        spans = [
+            _span(dict(zip(("start", "stop", "step"), own[part], strict=True)), f"subjects.spans.{subject}.{part}")
+            for part in ("train", "test")
+        ]
+        found[subject] = (spans[0], spans[1])
+    return found
+
+
 def _span(table: dict[str, Any], what: str) -> Span:
     start, stop, step = table["start"], table["stop"], table["step"]
     ends = stop > start if isinstance(stop, int) else stop == "max_frames"
@@ -215,6 +313,11 @@ def _build(c: dict[str, Any], profile: str) -> Protocol:
         test_cameras=_span(c["test"]["cameras"], "test.cameras"),
         test_except_train=c["test"]["cameras"]["except_train"],
         test_frames=_span(c["test"]["frames"], "test.frames"),
+        spans=_spans(c["subjects"].get("spans", {})),
+        also=tuple(
+            TestGroup(g["name"], _span(g["cameras"], "also.cameras"), _span(g["frames"], "also.frames"))
+            for g in c.get("also", [])
+        ),
         occlusion=OcclusionRule(
             rule=occlusion["rule"],
             unlisted=occlusion["unlisted"],
@@ -222,7 +325,8 @@ def _build(c: dict[str, Any], profile: str) -> Protocol:
             reference_width=occlusion["reference_width"],
             covers_fraction=share,
             covers_of=_one_of(occlusion["covers"]["of"], ("sampled", "raw"), "occlusion.covers.of"),
-            strips={k: (int(v[0]), int(v[1])) for k, v in occlusion["strips"].items()},
+            strips={k: (int(v[0]), int(v[1])) for k, v in occlusion.get("strips", {}).items()},
+            seed=occlusion.get("seed", 0),
         ),
         image=ImageRule(
             size=image["size"],

@@ -57,11 +57,16 @@ class RunResult:
         return f"real data ({about['variant']})"
 
 
+def group_row(row: str, group: str) -> str:
+    """What the row of a further group of test views is called."""
+    return f"{row} [{group}]" if group else row
+
+
 def view_rows(row: str, scores: Iterable[ViewScores]) -> list[dict[str, Any]]:
     """Per-view scores as JSON lines: one object per test view, absent numbers with their reasons."""
     return [
         {
-            "row": row,
+            "row": group_row(row, view.key.group),
             "camera": view.key.camera_id,
             "frame": view.key.frame,
             "scores": {identity: score.value for identity, score in view.scores.items()},

@@ -30,7 +30,7 @@ from ihbench.scene import Avatar, Capture, Method, TestView, TrainingSet
 from ihbench.score_stage import ScoreStage, spread
 from ihbench.scoring import Scorer
 from ihbench.store import RunFolder, RunIdentity
-from ihbench.views import OccludedScene, hidden_fraction, open_scene
+from ihbench.views import OccludedScene, open_scene
 
 if TYPE_CHECKING:
     from ihbench.body import Body
@@ -179,7 +179,7 @@ class _Run(RecordedRun):
             changed=_changed(request),
             left_out=[asdict(o) for o in left_out],
             measure=asdict(measure),
-            hidden_share=hidden_fraction(scene),
+            hidden_share=scene.hiding.hidden_share(),
         )
         self.folder.set_status("running", ledger=self.ledger)
         with self.ledger.stage("compile"):
@@ -204,7 +204,8 @@ class _Run(RecordedRun):
     def _curve_point(self, step: int, seconds: float, avatar: Avatar) -> None:
         """Score a checkpoint on a few fixed test views. The fit clock stands still meanwhile."""
         assert self.scorer is not None
-        chosen = spread(len(self.scorer.scene.test_keys), CURVE_VIEWS)
+        own = sum(not key.group for key in self.scorer.scene.test_keys)  # they come first
+        chosen = spread(own, CURVE_VIEWS)
         rows = {"now": lambda loaded: self._render(avatar, loaded.view)}
         views = [scored.scores["now"].scores for scored in self.scorer.scored(rows, chosen, slow=False)]
         scores = {i: mean_over_frames([view[i] for view in views]).value for i in views[0]}

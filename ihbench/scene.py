@@ -98,6 +98,11 @@ class Capture(Protocol):
     n_frames: int
     camera_ids: tuple[str, ...]
 
+    @property
+    def model(self) -> Body:
+        """The body model that the poses belong to. Raises `BadInput` when it is needed and was not given."""
+        ...
+
     def camera(self, camera: int) -> Camera: ...
 
     def body_pose(self, frame: int) -> BodyPose: ...

@@ -16,7 +16,7 @@ from ihbench.results import RunResult
 from ihbench.score_stage import ScoreStage
 from ihbench.scoring import Scorer
 from ihbench.store import RunFolder, RunIdentity
-from ihbench.views import OccludedScene, hidden_fraction, open_scene
+from ihbench.views import OccludedScene, open_scene
 
 if TYPE_CHECKING:
     from ihbench.body import Body
@@ -101,5 +101,5 @@ class _ScoreRun(RecordedRun):
             stage = ScoreStage(scorer, self.body, self.folder, self.request.runs, self.progress, self.request.force)
             background = self.scene.protocol.image.background
             stage.run(self.request.name, lambda loaded: self.found.read(loaded.key, background), threaded=True)
-        self.describe(hidden_share=hidden_fraction(self.scene), fit_seconds=None)
+        self.describe(hidden_share=self.scene.hiding.hidden_share(), fit_seconds=None)
         self.folder.set_status("done", ledger=self.ledger)

@@ -1,6 +1,6 @@
 """From a capture's stored images to the training and test views of a protocol.
 
-Order of operations, as in the released ZJU readers: occluder strip on the silhouette of the original image, lens
+Order of operations, as in the released ZJU readers: occluder on the silhouette of the original image, lens
 undistortion with unchanged K, background paint outside the silhouette, resampling, 8 bit.
 """
 
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ihbench.camera import Camera
 from ihbench.errors import BadInput
 from ihbench.metrics.images import bounds
-from ihbench.occlusion import Occlusion, apply_rule
+from ihbench.occlusion import OcclusionPlan, apply_rule
 from ihbench.protocol import ImageRule, Protocol
 from ihbench.scene import Capture, MaskState, TestView, TrainView
 
@@ -72,6 +72,7 @@ class TestViewKey:
     camera: int
     frame: int
     camera_id: str
+    group: str = ""  # further test views of a protocol are scored apart, under this name
 
     @property
     def name(self) -> str:
@@ -84,11 +85,10 @@ class OccludedScene:
 
     capture: Capture
     protocol: Protocol
-    occlusion: Occlusion
+    hiding: OcclusionPlan
     train: LazyViews[TrainView]
     test_keys: tuple[TestViewKey, ...]
     test: LazyViews[TestView]
-    covered: tuple[bool, ...]  # per training view
 
 
 class Undistorter:
@@ -117,7 +117,8 @@ class Undistorter:
                 cv2.CV_16SC2,
             )
             camera = camera.undistorted()
-        self.camera = camera.scaled(rule.size, rule.size)
+        self.size = rule.extent(camera.width, camera.height)
+        self.camera = camera.scaled(*self.size)
 
     def straighten(self, image: NDArray[Any]) -> NDArray[Any]:
         if self._maps is None:
@@ -125,7 +126,7 @@ class Undistorter:
         return self._cv2.remap(image, self._maps[0], self._maps[1], self._cv2.INTER_LINEAR)
 
     def shrink(self, image: NDArray[Any], how: str) -> NDArray[Any]:
-        return self._cv2.resize(image, (self._rule.size, self._rule.size), interpolation=self._flags[how])
+        return self._cv2.resize(image, self.size, interpolation=self._flags[how])
 
     def person(
         self, image: NDArray[np.uint8], silhouette: NDArray[np.bool_]
@@ -138,18 +139,20 @@ class Undistorter:
         return self._composited(image, alpha), self.shrink(alpha, self._rule.resample_mask) >= 128
 
     def _composited(self, image: NDArray[np.uint8], alpha: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """[size, size, 3]. Only the rectangle that holds the person is worked on: beyond it everything is background,
+        """[h, w, 3]. Only the rectangle that holds the person is worked on: beyond it everything is background,
         before and after resampling."""
-        size, (height, width) = self._rule.size, alpha.shape
+        height, width = alpha.shape
         # whole blocks of pixels, where resampling is a mean over blocks; all of the image elsewhere
-        block = width // size if self._rule.resample_image == "area" and width % size == 0 and width == height else 0
+        block = width // self.size[0] if self._rule.resample_image == "area" else 0
+        if (block * self.size[0], block * self.size[1]) != (width, height):
+            block = 0
         rows, columns = bounds(alpha > 0) or (slice(0, 1), slice(0, 1))
         if block:
             rows, columns = (slice(s.start // block * block, -(-s.stop // block) * block) for s in (rows, columns))
         share = alpha[rows, columns, None].astype(np.float32) / 255
         part = self._straight_part(image, rows, columns) * share + self.background * (1 - share)
         if block:
-            small = np.empty((size, size, 3), np.uint8)
+            small = np.empty((self.size[1], self.size[0], 3), np.uint8)
             small[:] = self.background
             target = tuple(slice(s.start // block, s.stop // block) for s in (rows, columns))
             shape = part.shape[1] // block, part.shape[0] // block
@@ -181,7 +184,8 @@ def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
     Raises `BadInput` when the capture has fewer frames or cameras than the protocol needs.
     """
     training = protocol.training_frames(capture.name, capture.n_frames)
-    frames_needed = max(training + protocol.testing_frames(capture.name, capture.n_frames), default=-1)
+    tested = protocol.test_views(capture.name, capture.n_frames, len(capture.camera_ids))
+    frames_needed = max([*training, *(frame for _, frame, _ in tested)], default=-1)
     if not training:
         raise BadInput(
             f"{capture.dataset} {capture.name}: {protocol.name} selects no training frame of its {capture.n_frames}"
@@ -197,11 +201,19 @@ def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
             f"{capture.dataset} {capture.name}: has {n_cameras} cameras, "
             f"training needs camera index {protocol.train_camera}"
         )
-    occlusion, frames, covered = apply_rule(protocol, capture)
-    train_camera = capture.camera(protocol.train_camera)
-    hidden = occlusion.hidden(train_camera.height)
-    undistort = {protocol.train_camera: Undistorter(train_camera, protocol.image)}
-    hidden_small = undistort[protocol.train_camera].touched(np.ascontiguousarray(hidden))
+    hiding = apply_rule(protocol, capture)
+    frames, covered = hiding.frames, hiding.covered
+    undistort = {protocol.train_camera: Undistorter(capture.camera(protocol.train_camera), protocol.image)}
+    last_touched: dict[int, tuple[NDArray[np.bool_], NDArray[np.bool_]]] = {}  # most rules hide the same every time
+
+    def hidden_of(frame: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Hidden pixels of the original image, and of the protocol's."""
+        hidden = hiding.occlusion.hidden(frame)
+        known = last_touched.get(0)
+        if known is None or known[0] is not hidden:
+            touched = undistort[protocol.train_camera].touched(np.ascontiguousarray(hidden))
+            known = last_touched[0] = (hidden, touched)
+        return known
 
     def silhouette(camera: int, frame: int) -> NDArray[np.bool_]:
         return capture.silhouette(camera, frame, protocol.silhouette)
@@ -210,24 +222,24 @@ def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
         lens, frame = undistort[protocol.train_camera], frames[k]
         person = silhouette(protocol.train_camera, frame)
         image = capture.image(protocol.train_camera, frame)
+        hidden = hidden_small = None
         if covered[k]:
+            hidden, hidden_small = hidden_of(frame)
             person = person & ~hidden
             # before anything is resampled: lens and kernel would carry hidden colours out of the strip
             image = np.where(hidden[..., None], lens.background, image)
         image, mask = lens.person(image, person)
         state = np.where(mask, MaskState.PERSON, MaskState.BACKGROUND).astype(np.uint8)
-        if covered[k]:
+        if hidden_small is not None:
             state[hidden_small] = MaskState.UNKNOWN
-        if covered[k]:
             image[hidden_small] = lens.background
         return TrainView(
             image, state, lens.camera, capture.body_pose(frame), frame, capture.camera_ids[protocol.train_camera]
         )
 
     keys = tuple(
-        TestViewKey(camera, frame, capture.camera_ids[camera])
-        for camera in protocol.testing_cameras(n_cameras)
-        for frame in protocol.testing_frames(capture.name, capture.n_frames)
+        TestViewKey(camera, frame, capture.camera_ids[camera], group)
+        for camera, frame, group in protocol.test_views(capture.name, capture.n_frames, n_cameras)
     )
     if not keys:
         raise BadInput(f"{capture.dataset} {capture.name}: {protocol.name} leaves no test view ({n_cameras} cameras)")
@@ -250,23 +262,8 @@ def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
     return OccludedScene(
         capture,
         protocol,
-        occlusion,
+        hiding,
         LazyViews(train_view, len(frames)),
         keys,
         LazyViews(test_view, len(keys), held=64),
-        tuple(covered),
     )
-
-
-def hidden_fraction(scene: OccludedScene) -> float:
-    """Share of the pooled person pixels of the covered training frames that the occluder hides, original pixels."""
-    protocol, capture = scene.protocol, scene.capture
-    person = hidden = 0
-    for view_frame, covered in zip(
-        protocol.training_frames(capture.name, capture.n_frames), scene.covered, strict=True
-    ):
-        if covered:
-            silhouette = capture.silhouette(protocol.train_camera, view_frame, protocol.silhouette)
-            person += int(silhouette.sum())
-            hidden += int(silhouette[:, scene.occlusion.columns].sum())
-    return hidden / person if person else 0.0

@@ -1,21 +1,32 @@
 """Occlusion rules: which pixels of the original training images an occluder hides.
 
 A rule is a pure function of an `OcclusionRequest`. It hides whole pixels of the original, distorted image, before
-undistortion, as the released readers do.
+undistortion, as the released readers do. Rules that draw something draw the same for a seed, subject and frame.
 """
 
 from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.errors import BadInput
-from ihbench.occlusion import Occlusion, OcclusionRequest
+from ihbench.occlusion import Mask, Occlusion, OcclusionRequest
+
+CLOTHES = 0.02  # share of the projected body's height by which garments may stand off it
+BLOCKS_ACROSS = 12  # random blocks along the longer side of the person
 
 
 def none(request: OcclusionRequest) -> Occlusion:
     """Hides nothing."""
-    return Occlusion("none", np.zeros(request.width, bool), {})
+    nothing: Mask = np.broadcast_to(np.False_, (request.height, request.width))
+    return Occlusion("none", lambda frame: nothing, {}, hides_nothing=True)
+
+
+# ----------------------------------------------------------------------------------------------------
+# The same columns in every covered frame
 
 
 def fixed_strip(request: OcclusionRequest) -> Occlusion:
@@ -26,10 +37,13 @@ def fixed_strip(request: OcclusionRequest) -> Occlusion:
     """
     rule = request.rule
     if request.subject not in rule.strips:
-        raise BadInput(f"occlusion 'fixed-strip': no strip is published for subject {request.subject!r}")
+        raise BadInput(
+            f"occlusion 'fixed-strip': no strip is published for subject {request.subject!r}; "
+            f"use --occlusion.rule strip-generic"
+        )
     mid, width = rule.strips[request.subject]
     scale = request.width / rule.reference_width
-    return _strip("fixed-strip", round(mid * scale), round(width * scale), request.width)
+    return _strip("fixed-strip", round(mid * scale), round(width * scale), request)
 
 
 def strip_generic(request: OcclusionRequest) -> Occlusion:
@@ -40,21 +54,167 @@ def strip_generic(request: OcclusionRequest) -> Occlusion:
     covered frame shows anybody.
     """
     columns = np.zeros(request.width, np.int64)
-    for frame, covered in zip(request.frames, request.covered, strict=True):
-        if covered:
-            columns += request.silhouette(frame).sum(0)
-    total = int(columns.sum())
-    if total == 0:
+    for frame in request.covered_frames:
+        columns += request.silhouette(frame).sum(0)
+    if columns.sum() == 0:
         raise BadInput(f"occlusion 'strip-generic': no person pixel in any covered frame of {request.subject!r}")
-    mid = round(float((np.arange(request.width) * columns).sum() / total))
-    for width in range(0, 2 * request.width + 2, 2):
-        strip = _strip("strip-generic", mid, width, request.width)
-        if columns[strip.columns].sum() >= request.rule.fraction * total:
-            return strip
-    raise AssertionError("a strip twice as wide as the image hides every pixel")
+    mid, width = _narrowest_band(columns, request.rule.fraction)
+    return _strip("strip-generic", mid, width, request)
 
 
-def _strip(rule: str, mid: int, width: int, image_width: int) -> Occlusion:
-    columns: NDArray[np.bool_] = np.zeros(image_width, bool)
+def _narrowest_band(counts: NDArray[np.integer], fraction: float) -> tuple[int, int]:
+    """(mid, even width) of the narrowest band around the mean position that holds this share of the counts [n]."""
+    total, n = int(counts.sum()), len(counts)
+    mid = round(float((np.arange(n) * counts).sum() / total))
+    below = np.concatenate([[0], np.cumsum(counts)])
+    half = np.arange(n + 1)
+    held = below[np.minimum(mid + half, n)] - below[np.maximum(mid - half, 0)]
+    return mid, 2 * int(np.flatnonzero(held >= fraction * total)[0])
+
+
+def _strip(rule: str, mid: int, width: int, request: OcclusionRequest) -> Occlusion:
+    columns: Mask = np.zeros(request.width, bool)
     columns[max(0, mid - width // 2) : max(0, mid + width // 2)] = True
-    return Occlusion(rule, columns, {"mid": mid, "width": width})
+    hidden = np.broadcast_to(columns, (request.height, request.width))
+    return Occlusion(rule, lambda frame: hidden, {"mid": mid, "width": width})
+
+
+# ----------------------------------------------------------------------------------------------------
+# Anew in every frame
+
+
+def central_band(request: OcclusionRequest) -> Occlusion:
+    """A full-height band that follows the person: centred on their mean column in every frame, as wide as it must be
+    (smallest even width) to hide at least `fraction` of the frame's person pixels."""
+
+    def hidden(frame: int, person: Mask) -> Mask:
+        mid, width = _narrowest_band(person.sum(0), request.rule.fraction)
+        columns = np.zeros(request.width, bool)
+        columns[max(0, mid - width // 2) : mid + width // 2] = True
+        return np.broadcast_to(columns, person.shape)
+
+    return _per_frame("central-band", request, hidden)
+
+
+def side(request: OcclusionRequest) -> Occlusion:
+    """Everything left of a column, in every frame the one that hides at least `fraction` of the person."""
+
+    def hidden(frame: int, person: Mask) -> Mask:
+        stop = _first_share(person.sum(0), request.rule.fraction)
+        return np.broadcast_to(np.arange(request.width) < stop, person.shape)
+
+    return _per_frame("side", request, hidden)
+
+
+def upper_half(request: OcclusionRequest) -> Occlusion:
+    """Everything above a row, in every frame the one that hides at least `fraction` of the person (a half by
+    default)."""
+
+    def hidden(frame: int, person: Mask) -> Mask:
+        stop = _first_share(person.sum(1), request.rule.fraction)
+        return np.broadcast_to((np.arange(request.height) < stop)[:, None], person.shape)
+
+    return _per_frame("upper-half", request, hidden)
+
+
+def lower_half(request: OcclusionRequest) -> Occlusion:
+    """Everything below a row, as a table before the person; in every frame at least `fraction` of them."""
+
+    def hidden(frame: int, person: Mask) -> Mask:
+        stop = _first_share(person.sum(1)[::-1], request.rule.fraction)
+        return np.broadcast_to((np.arange(request.height) >= request.height - stop)[:, None], person.shape)
+
+    return _per_frame("lower-half", request, hidden)
+
+
+def blocks(request: OcclusionRequest) -> Occlusion:
+    """Random square blocks, a twelfth of the person's longer side each, until at least `fraction` of the frame's
+    person is hidden. The last block is cut to what is still wanted."""
+
+    def hidden(frame: int, person: Mask) -> Mask:
+        rows, columns = np.nonzero(person)
+        block = max(1, max(np.ptp(rows), np.ptp(columns)) // BLOCKS_ACROSS)
+        cell = (np.arange(request.height) // block)[:, None] * request.width + np.arange(request.width) // block
+        rng = _rng(request, frame)
+        order = rng.permutation(np.unique(cell[person]))
+        counts = np.array([np.bincount(cell[person], minlength=cell.max() + 1)[k] for k in order])
+        wanted = request.rule.fraction * person.sum()
+        whole = int(np.searchsorted(np.cumsum(counts), wanted, side="right"))
+        out = np.isin(cell, order[:whole])
+        missing = int(np.ceil(wanted - counts[:whole].sum()))
+        if missing > 0:
+            last = cell == order[whole]
+            stop = _first_share((last & person).sum(1), missing / counts[whole])
+            out |= last & (np.arange(request.height) < stop)[:, None]
+        return out
+
+    return _per_frame("blocks", request, hidden)
+
+
+def pasted_object(request: OcclusionRequest) -> Occlusion:
+    """The silhouette of a made-up object (a smooth star-shaped blob, drawn anew for every subject) before the person,
+    at a seeded place that drifts slowly with the frames, as large as it must be to hide `fraction` of the person."""
+    seed = _rng(request, None)
+    waves = np.arange(2, 7)
+    shape = seed.normal(0, 0.5, (2, len(waves))) / waves
+    stretch = np.exp(seed.normal(0, 0.25))
+    start, drift = seed.uniform(0, 2 * np.pi), seed.uniform(0.5, 1.5)
+    last = max(request.covered_frames, default=0) + 1
+
+    def hidden(frame: int, person: Mask) -> Mask:
+        rows, columns = np.nonzero(person)
+        turn = start + drift * 2 * np.pi * frame / last
+        x = columns.mean() + 0.25 * np.ptp(columns) * np.cos(turn)
+        y = rows.mean() + 0.25 * np.ptp(rows) * np.sin(turn)
+        dy = (np.arange(request.height) + 0.5 - y)[:, None] / stretch
+        dx = (np.arange(request.width) + 0.5 - x)[None] * stretch
+        angle = np.arctan2(dy, dx)[..., None] * waves
+        outline = 1 + (shape[0] * np.cos(angle) + shape[1] * np.sin(angle)).sum(-1).clip(-0.6, 2)
+        size = np.hypot(dx, dy) / outline  # the object of this size reaches the pixel
+        reach = np.sort(size[person])
+        wanted = int(np.ceil(request.rule.fraction * len(reach)))
+        return size <= reach[wanted - 1] if wanted else np.zeros(person.shape, bool)
+
+    return _per_frame("object", request, hidden)
+
+
+def natural(request: OcclusionRequest) -> Occlusion:
+    """What stands before the person in the image itself: the projected body, a little grown for clothes, where the
+    mask of visible pixels does not show it. For data whose masks are of visible pixels (OcMotion)."""
+    from scipy.ndimage import binary_dilation
+
+    def hidden(frame: int, person: Mask) -> Mask:
+        body = request.body_mask(frame)
+        rows = np.flatnonzero(body.any(1))
+        if len(rows) == 0:
+            return np.zeros(person.shape, bool)
+        margin = max(1, round(CLOTHES * (rows[-1] - rows[0] + 1)))
+        return np.asarray(binary_dilation(body, iterations=margin)) & ~person
+
+    return _per_frame("natural", request, hidden)
+
+
+def _per_frame(rule: str, request: OcclusionRequest, hidden: Callable[[int, Mask], Mask]) -> Occlusion:
+    """A rule that looks at each frame by itself; a frame without anybody hides nothing."""
+
+    def of(frame: int) -> Mask:
+        person = request.silhouette(frame)
+        if not person.any() and rule != "natural":
+            return np.zeros(person.shape, bool)
+        return hidden(frame, person)
+
+    record = {} if rule == "natural" else {"fraction": request.rule.fraction}
+    if rule in ("blocks", "object"):
+        record["seed"] = request.rule.seed
+    return Occlusion(rule, of, record)
+
+
+def _first_share(counts: NDArray[np.integer], fraction: float) -> int:
+    """How many leading entries of counts [n] hold at least this share of them."""
+    held = np.concatenate([[0], np.cumsum(counts)])
+    return int(np.searchsorted(held, fraction * held[-1], side="left"))
+
+
+def _rng(request: OcclusionRequest, frame: int | None) -> np.random.Generator:
+    name = int.from_bytes(hashlib.sha256(request.subject.encode()).digest()[:4])
+    return np.random.default_rng([request.rule.seed, name, *([] if frame is None else [frame])])

@@ -124,6 +124,13 @@ def _table(
         if with_costs:
             cells += [_mean_of(group, "fit_seconds"), _mean_of(group, "total_seconds"), _largest(group, "peak_mb")]
         lines.append("| " + " | ".join(cells) + " |")
+        method = group[0].method
+        further = [row for k in chosen for row in rows_of[k] if row.startswith(f"{method} [")]
+        for row in dict.fromkeys(further):  # groups of test views that the protocol scores apart
+            having = [(runs[k].scene, rows_of[k][row]) for k in chosen if row in rows_of[k]]
+            name = label + row.removeprefix(method)
+            cells = [name, cells[1], cells[2], *(_cell(having, i) for i in columns), *([""] * len(costs))]
+            lines.append("| " + " | ".join(cells) + " |")
     for row in ROWS:
         having = list(
             {r.scene: (r.scene, rows[row]) for r, rows in zip(runs, rows_of, strict=True) if row in rows}.values()

@@ -4,21 +4,36 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
 
 from ihbench import registry
 from ihbench.commands.parse import options
 from ihbench.commands.scene_choice import SceneChoice
 from ihbench.errors import BadInput
 
+if TYPE_CHECKING:
+    from ihbench.protocol import Protocol
+
 
 def main(argv: list[str]) -> int:
     chosen = options(SceneChoice, argv, "plan", "What a run would do, what is left out and why. Runs nothing.")
+    from ihbench.protocol import load_protocol
+
+    protocols = chosen.apply(load_protocol(chosen.protocol, chosen.profile))
+    reports = [_planned(chosen, protocol) for protocol in protocols]
+    if chosen.json:
+        print(json.dumps(reports[0] if len(reports) == 1 else {"protocols": reports}, ensure_ascii=False))
+        return 0
+    for report in reports:
+        _print(report)
+    return 0
+
+
+def _planned(chosen: SceneChoice, protocol: Protocol) -> dict[str, Any]:
     from ihbench.data_source import locate, open_capture
     from ihbench.plan import absent_regions, expected_seconds, measure_scene
-    from ihbench.protocol import load_protocol
     from ihbench.run_loop import configuration
 
-    protocol = load_protocol(chosen.protocol, chosen.profile)
     config = configuration(chosen.method, chosen.profile, {})
     leave_out = registry.load("config", chosen.method).leave_out
     source = locate(protocol, chosen.data, chosen.scene)
@@ -46,11 +61,7 @@ def main(argv: list[str]) -> int:
             continue
         omissions = leave_out(config, measure) + absent_regions(measure, protocol.regions)
         report["scenes"][scene] = {"measure": asdict(measure), "left_out": [asdict(o) for o in omissions]}
-    if chosen.json:
-        print(json.dumps(report, ensure_ascii=False))
-        return 0
-    _print(report)
-    return 0
+    return report
 
 
 def _print(report: dict) -> None:

@@ -14,14 +14,12 @@ from ihbench.commands.scene_choice import SceneChoice
 from ihbench.errors import BadInput
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunOptions(SceneChoice):
     seed: tuple[int, ...] = (0,)
     """Seeds; each is a run of its own."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to fit."""
-    occlusion: str | None = None
-    """Another occlusion rule than the protocol's, for example none. Never in one table with the protocol's own."""
     keep: tuple[str, ...] = ()
     """Switches that the plan must not change for this scene; "all" keeps everything."""
     force: bool = False
@@ -53,7 +51,7 @@ def _with_switches(method: str, profile: str) -> type[RunOptions]:
     config = profiles[profile]
     switches = Annotated[type(config), tyro.conf.arg(name="method")]
     return make_dataclass(
-        "RunOptions", [("config", switches, field(default=config))], bases=(RunOptions,), frozen=True
+        "RunOptions", [("config", switches, field(default=config))], bases=(RunOptions,), frozen=True, kw_only=True
     )
 
 
@@ -68,24 +66,23 @@ def _run(chosen: Any) -> int:
     from ihbench.results import as_json
     from ihbench.run_loop import RunRequest, run_scene
 
-    protocol = load_protocol(chosen.protocol, chosen.profile)
-    if chosen.occlusion is not None:
-        registry.entry_point("occlusion", chosen.occlusion)
-        protocol = protocol.with_occlusion(chosen.occlusion)
+    protocols = chosen.apply(load_protocol(chosen.protocol, chosen.profile))
     if chosen.keep and "all" not in chosen.keep:
         _check_keep(chosen.keep, chosen.config)
     if not chosen.seed or min(chosen.seed) < 0:
         raise BadInput(f"--seed {' '.join(map(str, chosen.seed))}: expected one number or more, each 0 or above")
-    source = locate(protocol, chosen.data, chosen.scene)
     progress = Progress()
-    request = RunRequest(
-        protocol, chosen.method, chosen.config, 0, chosen.device, chosen.runs, chosen.body, chosen.force, chosen.keep
-    )
     results = []
-    for scene in source.scenes:
-        for seed in dict.fromkeys(chosen.seed):
-            progress.say(f"{protocol.name} {scene}: {chosen.method}, {chosen.profile} profile, seed {seed}")
-            results.append(run_scene(replace(request, seed=seed), source, scene, progress))
+    for protocol in protocols:
+        source = locate(protocol, chosen.data, chosen.scene)
+        request = RunRequest(
+            protocol, chosen.method, chosen.config, 0, chosen.device, chosen.runs, chosen.body, chosen.force,
+            chosen.keep,
+        )  # fmt: skip
+        for scene in source.scenes:
+            for seed in dict.fromkeys(chosen.seed):
+                progress.say(f"{protocol.name} {scene}: {chosen.method}, {chosen.profile} profile, seed {seed}")
+                results.append(run_scene(replace(request, seed=seed), source, scene, progress))
     text = registry.load("report", "md")(results)
     if chosen.json:
         print(json.dumps(as_json(results), allow_nan=False))

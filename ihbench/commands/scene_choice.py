@@ -2,12 +2,49 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ihbench import registry
+
+if TYPE_CHECKING:
+    from ihbench.protocol import Protocol
 
 
 @dataclass(frozen=True)
-class SceneChoice:
+class OcclusionChoice:
+    """Another occlusion than the protocol's. Never in one table with the protocol's own."""
+
+    rule: str | None = None
+    """none, fixed-strip, strip-generic, central-band, object, side, upper-half, lower-half, blocks, natural."""
+    fraction: tuple[float, ...] = ()
+    """Share of the person to hide in covered frames; several make a sweep."""
+    covers: float | None = None
+    """Share of the training frames that are covered."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProtocolChanges:
+    """What of a protocol can be changed on the command line."""
+
+    occlusion: OcclusionChoice = field(default_factory=OcclusionChoice)
+    train_frames: str | None = None
+    """Other training frames, START:STOP:STEP."""
+    test_frames: str | None = None
+    """Other (held-out) test frames, START:STOP:STEP."""
+
+    def apply(self, protocol: Protocol) -> list[Protocol]:
+        """The protocols that these options mean: one, or one for each severity. Raises `BadInput`."""
+        if self.occlusion.rule is not None:
+            registry.entry_point("occlusion", self.occlusion.rule)
+        protocol = protocol.with_frames(self.train_frames, self.test_frames)
+        fractions = tuple(dict.fromkeys(self.occlusion.fraction)) or (None,)
+        return [protocol.with_occlusion(self.occlusion.rule, f, self.occlusion.covers) for f in fractions]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneChoice(ProtocolChanges):
     protocol: str
     """A registered protocol (`ihbench list protocols`), or the path of a protocol file of your own (.toml)."""
     method: str = "inpainthuman"

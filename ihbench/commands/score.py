@@ -9,14 +9,15 @@ from typing import TYPE_CHECKING
 
 from ihbench import registry
 from ihbench.commands.parse import options
+from ihbench.commands.scene_choice import ProtocolChanges
 from ihbench.errors import BadInput
 
 if TYPE_CHECKING:
     from ihbench.data_source import DataSource
 
 
-@dataclass(frozen=True)
-class ScoreOptions:
+@dataclass(frozen=True, kw_only=True)
+class ScoreOptions(ProtocolChanges):
     protocol: str
     """A registered protocol (`ihbench list protocols`), or the path of a protocol file of your own (.toml)."""
     predictions: Path
@@ -53,7 +54,12 @@ def main(argv: list[str]) -> int:
     from ihbench.results import as_json
     from ihbench.score_predictions import ScoreRequest, score_scene
 
-    protocol = load_protocol(chosen.protocol, chosen.profile or _profile_of(chosen.predictions, chosen.protocol))
+    protocols = chosen.apply(
+        load_protocol(chosen.protocol, chosen.profile or _profile_of(chosen.predictions, chosen.protocol))
+    )
+    if len(protocols) > 1:
+        raise BadInput("--occlusion.fraction: predictions were made under one severity; name that one")
+    protocol = protocols[0]
     source = locate(protocol, chosen.data, chosen.scene)
     if chosen.names:
         return _print_names(chosen, source)
@@ -93,13 +99,13 @@ def _profile_of(root: Path, protocol: str) -> str:
     if not root.is_dir():
         return PROFILES[0]
     for path in image_files(root):
-        height = len(read_image(path, (1.0, 1.0, 1.0)))
+        side = max(read_image(path, (1.0, 1.0, 1.0)).shape[:2])
         sizes = {name: load_protocol(protocol, name).image.size for name in PROFILES}
         for name, size in sizes.items():
-            if size == height:
+            if size == side:
                 return name
         told = ", ".join(f"{size} px in {name}" for name, size in sizes.items())
-        raise BadInput(f"prediction {path}: is {height} px high; {protocol} has {told}")
+        raise BadInput(f"prediction {path}: is {side} px on its longer side; {protocol} has {told}")
     return PROFILES[0]
 
 

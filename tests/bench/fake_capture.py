@@ -95,6 +95,10 @@ class FakeCapture:
     _photographs: dict[tuple[int, int], tuple[NDArray, NDArray]] = field(default_factory=dict)
 
     @property
+    def model(self) -> Body:
+        return the_body()
+
+    @property
     def n_frames(self) -> int:
         return len(self.poses)
 

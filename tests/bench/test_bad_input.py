@@ -193,7 +193,7 @@ def test_everybody_hidden_in_every_frame(refused_run, refused, tmp_path, monkeyp
         ("run --protocol zju_occ --method inpainthumann", "did you mean 'inpainthuman'?"),
         ("run --protocol zju_occ --scene standin-11", "unknown scene 'standin-11'"),
         ("run --protocol zju_occ --profile quik", "did you mean 'quick'?"),
-        ("run --protocol zju_occ --occlusion fixed-stripe", "did you mean 'fixed-strip'?"),
+        ("run --protocol zju_occ --occlusion.rule fixed-stripe", "did you mean 'fixed-strip'?"),
         ("run --protocol zju_occ --keep level", "did you mean 'levels'?"),
         ("run --protocol zju_occ --sede 3", "Perhaps you meant: --seed"),
         ("run --protocol zju_occ --seed three", "Error parsing --seed"),

@@ -93,7 +93,7 @@ def test_two_scenes_share_a_row_whose_number_is_the_mean_of_the_scenes_means(ben
 
 
 def test_runs_under_other_occlusion_stand_in_another_table(bench, mannequin):
-    for more in ((), ("--occlusion", "none")):
+    for more in ((), ("--occlusion.rule", "none")):
         assert bench.run(*more, method=mannequin).status == 0
     text = bench("report", "--runs", bench.runs).out
     first, second = text.split("\n\n## ")

@@ -13,7 +13,7 @@ from ihbench.methods.inpainthuman.config import PAPER, QUICK, leave_out
 from ihbench.plan import TEXELS, SceneMeasure, absent_regions, expected_seconds, measure_scene
 from ihbench.protocol import REGIONS
 from ihbench.scene import BodyPose
-from ihbench.views import hidden_fraction, open_scene
+from ihbench.views import open_scene
 from ihbench.visibility import texel_visibility
 
 from .fake_capture import DISTANCE, DISTORTION, FOCAL, SIZE, FakeCapture, a_camera, a_pose, fake_protocol, the_body
@@ -68,7 +68,7 @@ def test_what_is_measured_on_raw_masks_holds_on_the_views_a_method_gets(distorti
     assert found.visible_texels == pytest.approx(seen.visible.mean(), abs=0.04)
     assert found.hidden_texels == pytest.approx(seen.hidden.mean(), abs=0.04)
     assert found.never_seen_texels == pytest.approx(seen.never_seen.mean(), abs=0.02)
-    assert found.hidden_share == pytest.approx(hidden_fraction(scene))
+    assert found.hidden_share == pytest.approx(scene.hiding.hidden_share())
 
 
 def test_large_images_are_reduced_without_a_shift():

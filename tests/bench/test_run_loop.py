@@ -168,7 +168,7 @@ def test_force_repeats_the_run_bit_for_bit(bench_with_run, finished, monkeypatch
     assert {n for n in again if n.startswith("renders/") and again[n] != before[n]} == set()
 
 
-@pytest.mark.parametrize("change", ["--seed 1", "--method.steps 3", "--occlusion none"])
+@pytest.mark.parametrize("change", ["--seed 1", "--method.steps 3", "--occlusion.rule none"])
 def test_what_moves_the_answer_makes_another_run(bench_with_run, finished, change):
     assert bench_with_run.run(*change.split()).status == 0
     (other,) = {folder.name for folder in bench_with_run.folders()} - {finished.folder.name}
@@ -221,7 +221,7 @@ def test_only_occluded_frames_have_unknown_pixels_and_none_without_an_occluder(s
 
 
 def test_without_an_occluder_no_surface_is_hidden_and_the_table_says_why(bench, mannequin):
-    outcome = bench.run("--occlusion", "none", method=mannequin)
+    outcome = bench.run("--occlusion.rule", "none", method=mannequin)
     (folder,) = bench.folders()
     about = read_json(folder / "run.json")["about"]
     assert about["measure"]["hidden_texels"] == about["hidden_share"] == 0

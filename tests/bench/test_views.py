@@ -12,7 +12,7 @@ from ihbench.camera import Camera, distort
 from ihbench.errors import BadInput
 from ihbench.protocol import Span, load_protocol
 from ihbench.scene import BodyPose, MaskState
-from ihbench.views import LazyViews, TestViewKey, Undistorter, hidden_fraction, open_scene
+from ihbench.views import LazyViews, TestViewKey, Undistorter, open_scene
 
 from .fake_capture import DISTORTION, SIZE, FakeCapture, a_camera, fake_protocol, rasterized, turning_capture
 
@@ -55,14 +55,14 @@ def same(a, b):
 def test_nothing_behind_the_strip_reaches_a_training_view(capture, base, size):
     protocol = fake_protocol(base, size=size, strip=STRIP)
     clean, dirty = open_scene(capture, protocol), open_scene(scrambled(capture), protocol)
-    assert sum(clean.covered) == 8
-    for covered, a, b in zip(clean.covered, clean.train, dirty.train, strict=True):
+    assert sum(clean.hiding.covered) == 8
+    for covered, a, b in zip(clean.hiding.covered, clean.train, dirty.train, strict=True):
         assert same(a, b) == covered
 
 
 def test_a_strip_nobody_hides_behind_hides_the_frame_anyway(capture):
     scene = open_scene(capture, fake_protocol(strip=STRIP))
-    for covered, view in zip(scene.covered, scene.train, strict=True):
+    for covered, view in zip(scene.hiding.covered, scene.train, strict=True):
         assert (view.mask == MaskState.UNKNOWN).any() == covered
         assert set(np.unique(view.mask)) == ({0, 1, 2} if covered else {0, 1})
 
@@ -260,7 +260,7 @@ def test_truth_is_never_occluded_and_never_of_the_training_camera(capture):
 def test_views_carry_what_they_were_taken_with(capture):
     scene = open_scene(capture, replace(fake_protocol(strip=STRIP), train_frames=Span(1, 10, 3), train_camera=2))
     assert [view.frame for view in scene.train] == [1, 4, 7]
-    assert scene.covered == (True, True, True)
+    assert scene.hiding.covered == (True, True, True)
     assert {view.camera_id for view in scene.train} == {"cam2"}
     assert scene.train[1].body_pose is capture.poses[4]
     assert {key.camera for key in scene.test_keys} == {0, 1, 3}
@@ -357,9 +357,9 @@ def test_preload_makes_everything_that_fits():
 
 def test_strip_generic_hides_half_and_hardly_more(capture):
     scene = open_scene(capture, fake_protocol())
-    share = hidden_fraction(scene)
+    share = scene.hiding.hidden_share()
     pooled = sum(capture.silhouette(0, k).sum(0) for k in range(8))
-    columns = np.flatnonzero(scene.occlusion.columns)
+    columns = np.flatnonzero(scene.hiding.occlusion.hidden(0)[0])
     assert share == pytest.approx(pooled[columns].sum() / pooled.sum())
     widest = (pooled[columns[0]] + pooled[columns[-1]]) / pooled.sum()
     assert 0.5 <= share <= 0.5 + widest
@@ -369,8 +369,8 @@ def test_nothing_covered_hides_nothing():
     protocol = fake_protocol(rule="none")
     protocol = replace(protocol, occlusion=replace(protocol.occlusion, covers_fraction=0.0))
     scene = open_scene(turning_capture(), protocol)
-    assert not any(scene.covered)
-    assert hidden_fraction(scene) == 0.0
+    assert not any(scene.hiding.covered)
+    assert scene.hiding.hidden_share() == 0.0
 
 
 def test_names_of_test_views_sort_like_their_frames():

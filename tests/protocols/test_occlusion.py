@@ -1,22 +1,26 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from ihbench.errors import BadInput
 from ihbench.occlusion import OcclusionRequest
 from ihbench.protocol import load_protocol
+from ihbench.protocols import occlusion
 from ihbench.protocols.occlusion import fixed_strip, none, strip_generic
 
 
-def request(subject="377", width=1024, silhouettes=None, covered=None, protocol="zju_occ"):
+def request(subject="377", width=1024, silhouettes=None, covered=None, protocol="zju_occ", **changed):
     silhouettes = silhouettes if silhouettes is not None else [np.ones((4, width), bool)]
     return OcclusionRequest(
         subject=subject,
-        rule=load_protocol(protocol, "paper").occlusion,
+        rule=replace(load_protocol(protocol, "paper").occlusion, **changed),
         frames=list(range(len(silhouettes))),
         covered=covered or [True] * len(silhouettes),
         width=width,
-        height=4,
+        height=len(silhouettes[0]),
         silhouette=lambda k: silhouettes[k],
+        body_mask=lambda k: silhouettes[k],
     )
 
 
@@ -34,12 +38,12 @@ def request(subject="377", width=1024, silhouettes=None, covered=None, protocol=
     ],
 )
 def test_published_columns(protocol, subject, first, last):
-    columns = np.flatnonzero(fixed_strip(request(subject, protocol=protocol)).columns)
+    columns = np.flatnonzero(fixed_strip(request(subject, protocol=protocol)).hidden(0)[0])
     assert (columns[0], columns[-1], len(columns)) == (first, last, last - first + 1)
 
 
 def test_a_strip_scales_with_the_image():
-    assert np.flatnonzero(fixed_strip(request(width=512)).columns)[[0, -1]].tolist() == [213, 246]
+    assert np.flatnonzero(fixed_strip(request(width=512)).hidden(0)[0])[[0, -1]].tolist() == [213, 246]
 
 
 def test_no_published_strip_is_said():
@@ -58,7 +62,7 @@ def test_generic_strip_is_the_narrowest_that_hides_half_and_is_centred_on_the_pe
     covered = [True, True, False, True, True, True]
     strip = strip_generic(request(width=100, silhouettes=silhouettes, covered=covered))
     pooled = sum(s.sum(0) for s, c in zip(silhouettes, covered, strict=True) if c)
-    share = pooled[strip.columns].sum() / pooled.sum()
+    share = pooled[strip.hidden(0)[0]].sum() / pooled.sum()
     mid, width = strip.record["mid"], strip.record["width"]
     narrower = pooled[mid - (width - 2) // 2 : mid + (width - 2) // 2].sum() / pooled.sum()
     assert narrower < 0.5 <= share
@@ -72,4 +76,71 @@ def test_generic_strip_without_anybody_is_an_error():
 
 
 def test_none_hides_nothing():
-    assert not none(request()).columns.any()
+    assert not none(request()).hidden(0).any()
+
+
+def walkers(n=5, size=(160, 200)):
+    """A figure of two ellipses that walks through the image."""
+    rows, columns = np.mgrid[: size[0], : size[1]]
+    return [
+        (((rows - 90) / 60) ** 2 + ((columns - 50 - 22 * k) / 17) ** 2 < 1)
+        | (((rows - 25) / 15) ** 2 + ((columns - 52 - 22 * k) / 12) ** 2 < 1)
+        for k in range(n)
+    ]
+
+
+RULES = ["strip_generic", "central_band", "pasted_object", "side", "upper_half", "lower_half", "blocks"]
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("fraction", [0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.0])
+def test_a_rule_hides_the_share_that_it_is_asked_for(rule, fraction):
+    people = walkers(1) if rule == "strip_generic" else walkers()
+    found = getattr(occlusion, rule)(request("anybody", 200, people, fraction=fraction))
+    hidden = [(person & found.hidden(k)).sum() / person.sum() for k, person in enumerate(people)]
+    assert all(h >= fraction - 1e-12 for h in hidden)
+    # two columns of these small people are 7 % of them
+    assert max(hidden) - fraction < (0.1 if rule in ("strip_generic", "central_band") else 0.06)
+    if fraction == 0:
+        assert max(hidden) == 0
+
+
+@pytest.mark.parametrize("rule", ["pasted_object", "blocks"])
+def test_what_is_drawn_depends_on_seed_subject_and_frame_only(rule):
+    people = walkers()
+    draw = lambda **k: getattr(occlusion, rule)(request("a", 200, people, fraction=0.4, **k)).hidden(3)  # noqa: E731
+    assert (draw() == draw()).all()
+    assert (draw() != draw(seed=1)).any()
+    other = getattr(occlusion, rule)(request("b", 200, people, fraction=0.4)).hidden(3)
+    assert (draw() != other).any()
+
+
+def test_a_band_follows_the_person_and_halves_are_on_their_side():
+    people = walkers()
+    ask = request("a", 200, people, fraction=0.4)
+    middle = [np.flatnonzero(occlusion.central_band(ask).hidden(k)[0]).mean() for k in range(5)]
+    assert np.diff(middle) == pytest.approx([22] * 4, abs=1)
+    assert occlusion.upper_half(ask).hidden(0)[0].all()
+    assert not occlusion.upper_half(ask).hidden(0)[-1].any()
+    assert occlusion.lower_half(ask).hidden(0)[-1].all()
+    assert not occlusion.lower_half(ask).hidden(0)[0].any()
+    assert occlusion.side(ask).hidden(0)[:, 0].all()
+    assert not occlusion.side(ask).hidden(0)[:, -1].any()
+
+
+@pytest.mark.parametrize("rule", ["central_band", "pasted_object", "side", "upper_half", "lower_half", "blocks"])
+def test_a_frame_without_anybody_hides_nothing(rule):
+    empty = [np.zeros((20, 30), bool)]
+    assert not getattr(occlusion, rule)(request("a", 30, empty)).hidden(0).any()
+
+
+def test_natural_is_the_body_that_the_mask_does_not_show():
+    body = walkers(1)[0]
+    shown = body.copy()
+    shown[100:] = False
+    ask = replace(request("a", 200, [shown]), body_mask=lambda frame: body)
+    hidden = occlusion.natural(ask).hidden(0)
+    assert not (hidden & shown).any()
+    assert hidden[100:][body[100:]].all()
+    margin = hidden & ~body
+    assert 0 < margin.sum() < 0.3 * body.sum()

@@ -1,0 +1,256 @@
+"""What pose estimators give, as a `Camera` and a `BodyPose`; pure functions, one frame a call.
+
+All of them pose SMPL in its standard root convention, v = R(theta_0) (v0 - J0) + J0 + t: about the pelvis joint, then
+the translation. EasyMocap alone keeps ZJU-MoCap's root (`root_convention`). Outputs in the camera's frame have OpenCV
+axes (x right, y down, z forward), so an upright person's root is turned by about pi about x.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench.body.root_convention import from_zju_root
+from ihbench.body.skinning_numpy import axis_angle_to_matrix
+from ihbench.camera import Camera
+from ihbench.errors import BadInput
+from ihbench.scene import BodyPose
+
+if TYPE_CHECKING:
+    from ihbench.body.model import Body
+
+Array = NDArray[np.float64]
+
+SIX_D_LAYOUTS = ("columns", "interleaved", "rows")
+UP_AXES = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+WORLD_AXES = {f"{sign}{axis}": s * np.eye(3)[k] for k, axis in enumerate("xyz") for sign, s in (("+", 1), ("-", -1))}
+
+
+def from_weak_perspective(
+    pose: Any,  # [72] or [24, 3] rad, root in the camera's frame
+    betas: Any,  # [B]
+    scale_translation: Any,  # (s, tx, ty) of the crop camera
+    box: Any,  # (cx, cy, size) px: centre and side of the square crop in the full image, whose corner is (0, 0)
+    focal: float,  # px, of the full image
+    width: int,
+    height: int,
+) -> tuple[Camera, BodyPose]:
+    """HMR, SPIN, VIBE, 4D-Humans: a crop camera -> a pinhole camera at the origin and the body in front of it.
+
+    The crop camera maps a body point (X, Y, Z) to x = s (X + tx), y = s (Y + ty) in [-1, 1]², that is, to column
+    cx + size/2 · s (X + tx) of the full image. The pinhole camera maps it to width/2 + focal (X + Tx) / (Z + Tz).
+    Equal at Z = 0 for every X when focal / Tz = s · size / 2 and focal Tx / Tz = cx - width/2 + s · size / 2 · tx:
+
+        Tz = 2 focal / (s · size),   Tx = tx + 2 (cx - width/2) / (s · size),   Ty = ty + 2 (cy - height/2) / (s · size)
+
+    For other Z, distances from the image's centre differ by the factor 1 + Z / Tz, as perspective has it. A wrong
+    `focal` moves the body nearer or farther and hardly moves its pixels. Raises `BadInput`.
+    """
+    s, tx, ty = _numbers("scale and translation (s, tx, ty)", scale_translation, (3,))
+    cx, cy, size = _numbers("crop box (cx, cy, size)", box, (3,))
+    (f,) = _numbers("focal length", np.reshape(focal, -1), (1,))
+    if s <= 0 or size <= 0 or f <= 0:
+        raise BadInput(
+            f"weak perspective: expected scale, box size and focal length above 0, got {s:.4g}, {size:.4g}, {f:.4g}"
+        )
+    width, height = _size(width, height)
+    per_metre = s * size / 2  # px
+    transl = [tx + (cx - width / 2) / per_metre, ty + (cy - height / 2) / per_metre, f / per_metre]
+    K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]])
+    return Camera(K, np.eye(3), np.zeros(3), width, height), BodyPose(_pose(pose), _betas(betas), np.array(transl))
+
+
+def from_camera_space(
+    pose: Any,  # [72] or [24, 3] rad, root in the camera's frame
+    betas: Any,  # [B]
+    transl: Any,  # [3] m, in the camera's frame
+    K: Any,  # [3, 3] px, or a focal length: then the principal point is the image's centre
+    width: int,
+    height: int,
+    pixel_center: float = 0.5,  # where K puts the centre of the first pixel; OpenCV's calibration: 0.0
+) -> tuple[Camera, BodyPose]:
+    """ROMP and BEV (cam_trans), WHAM and GVHMR ("incam"), TRAM: already a body before a pinhole camera.
+
+    Their camera is the origin of the world here. Raises `BadInput`, also for a body behind the camera.
+    """
+    width, height = _size(width, height)
+    transl = _numbers("transl", transl, (3,))
+    if transl[2] <= 0:
+        raise BadInput(
+            f"transl: expected the body in front of the camera, got z = {transl[2]:.4g} m; "
+            f"turn OpenGL axes into OpenCV's (y down, z forward) first"
+        )
+    camera = Camera(_K(K, width, height, pixel_center), np.eye(3), np.zeros(3), width, height)
+    return camera, BodyPose(_pose(pose), _betas(betas), transl)
+
+
+def from_world(
+    pose: Any,  # [72] or [24, 3] rad, root in the world
+    betas: Any,  # [B]
+    transl: Any,  # [3] m, in the world
+    R_w2c: Any,  # [3, 3]
+    t_w2c: Any,  # [3] m
+    K: Any,  # [3, 3] px, or a focal length
+    width: int,
+    height: int,
+    up: str = "y",  # the world axis against gravity: "y" or "z"
+    pixel_center: float = 0.5,
+) -> tuple[Camera, BodyPose]:
+    """WHAM and GVHMR ("global"), SLAHMR: a body in a gravity-aligned world, and the frame's camera in that world.
+
+    The world is kept as it is. Raises `BadInput`, also when image and body together stand along another axis than
+    `up`: then the world was turned or flipped on the way. (Either of them alone may lie or look down.)
+    """
+    width, height = _size(width, height)
+    if up not in UP_AXES:
+        raise BadInput(f"up axis {up!r}: expected y or z")
+    R = _numbers("R world to camera", R_w2c, (3, 3))
+    _check_rotations("R world to camera", R)
+    t = _numbers("t world to camera", t_w2c, (3,))
+    body_pose = BodyPose(_pose(pose), _betas(betas), _numbers("transl", transl, (3,)))
+    upright = axis_angle_to_matrix(body_pose.pose[0])[:, 1] - R[1]  # of the body, plus that of the image
+    best = max(WORLD_AXES, key=lambda axis: upright @ WORLD_AXES[axis])
+    if upright @ WORLD_AXES[best] > 1.5 and upright @ np.array(UP_AXES[up]) < 0.5:
+        raise BadInput(
+            f"world: expected +{up} to point up, but picture and body both stand along {best}; "
+            f"give the other up axis, or poses and cameras of one world"
+        )
+    return Camera(_K(K, width, height, pixel_center), R, t, width, height), body_pose
+
+
+def from_easymocap(
+    poses: Any,  # 72 numbers with a zero root, or 69 without it; rad
+    shapes: Any,  # [B]
+    Rh: Any,  # [3] rad
+    Th: Any,  # [3] m
+    body: Body,
+) -> BodyPose:
+    """EasyMocap's SMPL fit, as ZJU-MoCap keeps it: v = R(Rh) v_zero_root + Th, about the model's origin.
+
+    In the calibration's world; its cameras are OpenCV's (`Camera.from_opencv`). Raises `BadInput`, also for the 87
+    numbers of an SMPL-X fit.
+    """
+    values = _numbers("EasyMocap poses", poses, None).reshape(-1)
+    if values.size not in (69, 72):
+        hint = "; these are SMPL-X or SMPL-H poses, fit with --body smpl" if values.size > 72 else ""
+        raise BadInput(f"EasyMocap poses: expected 72 numbers (or 69 without the root), got {values.size}{hint}")
+    rotation, translation = (_numbers(name, np.reshape(value, -1), (3,)) for name, value in (("Rh", Rh), ("Th", Th)))
+    return from_zju_root(values, _betas(shapes), rotation, translation, body)
+
+
+def matrix_to_axis_angle(
+    matrices: Any,  # [..., 3, 3]
+) -> Array:
+    """[..., 3] rad, of length 0 to pi: the inverse of `axis_angle_to_matrix`, exact near 0 and near pi as well.
+
+    Rounded rotations (float32, half precision) are accepted. Raises `BadInput` for other matrices.
+    """
+    R = _numbers("rotation matrices", matrices, None)
+    if R.shape[-2:] != (3, 3):
+        raise BadInput(f"rotation matrices: expected shape [..., 3, 3], got {list(R.shape)}")
+    _check_rotations("rotation matrices", R)
+    m = {(i, j): R[..., i, j] for i in range(3) for j in range(3)}
+    # 4 q qᵀ, a row for each of w, x, y, z: every row is the quaternion, scaled; the longest loses no digits
+    products = [
+        [1 + m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
+        [m[2, 1] - m[1, 2], 1 + m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
+        [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], 1 - m[0, 0] + m[1, 1] - m[2, 2], m[1, 2] + m[2, 1]],
+        [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], 1 - m[0, 0] - m[1, 1] + m[2, 2]],
+    ]
+    table = np.stack([np.stack(row, -1) for row in products], -2)  # [..., 4, 4]
+    longest = np.diagonal(table, axis1=-2, axis2=-1).argmax(-1)
+    q = np.take_along_axis(table, longest[..., None, None], -2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    q = np.where(q[..., :1] < 0, -q, q)
+    sine = np.linalg.norm(q[..., 1:], axis=-1)
+    angle = 2 * np.arctan2(sine, q[..., 0])
+    return q[..., 1:] * np.where(sine > 0, angle / np.where(sine > 0, sine, 1), 2)[..., None]
+
+
+def six_d_to_matrix(
+    values: Any,  # [..., 6]
+    layout: str,
+) -> Array:
+    """[..., 3, 3] from the 6-number rotations of Zhou et al., which nobody orders alike. `layout` says how:
+
+    "columns": the first column, then the second (4D-Humans);
+    "interleaved": R00 R01 R10 R11 R20 R21, the first two columns read row by row (SPIN, VIBE, PARE, ROMP);
+    "rows": the first row, then the second (PyTorch3D, and so GVHMR).
+
+    Raises `BadInput`, also for numbers that span no plane.
+    """
+    d = _numbers("6D rotations", values, None)
+    if layout not in SIX_D_LAYOUTS:
+        raise BadInput(f"6D rotation layout {layout!r}: expected {', '.join(SIX_D_LAYOUTS)}")
+    if d.ndim == 0 or d.shape[-1] != 6:
+        raise BadInput(f"6D rotations: expected shape [..., 6], got {list(d.shape)}")
+    first, second = (d[..., 0::2], d[..., 1::2]) if layout == "interleaved" else (d[..., :3], d[..., 3:])
+    a = _unit(first)
+    b = _unit(second - (a * second).sum(-1, keepdims=True) * a)
+    return np.stack([a, b, np.cross(a, b)], -2 if layout == "rows" else -1)
+
+
+def _unit(vectors: Array) -> Array:
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    if (length < 1e-8).any():
+        raise BadInput("6D rotations: expected two independent directions, got zero or parallel ones")
+    return vectors / length
+
+
+def _numbers(what: str, value: Any, shape: tuple[int, ...] | None) -> Array:
+    try:
+        array = np.array(value, np.float64)
+    except (TypeError, ValueError):
+        raise BadInput(f"{what}: expected numbers, got a {type(value).__name__} of other contents") from None
+    if shape is not None and array.shape != shape:
+        raise BadInput(f"{what}: expected shape {list(shape)}, got {list(array.shape)}")
+    if not np.isfinite(array).all():
+        raise BadInput(f"{what}: expected finite numbers, got NaN or infinity; leave this frame out")
+    return array
+
+
+def _pose(pose: Any) -> Array:
+    array = _numbers("pose", pose, None)
+    if array.shape not in ((72,), (1, 72), (24, 3)):
+        hint = "; convert rotations with matrix_to_axis_angle" if array.shape[-2:] == (3, 3) else ""
+        raise BadInput(f"pose: expected 72 numbers of axis-angle, [72] or [24, 3], got {list(array.shape)}{hint}")
+    return array.reshape(24, 3)
+
+
+def _betas(betas: Any) -> Array:
+    array = _numbers("betas", betas, None)
+    if array.ndim == 2 and len(array) == 1:
+        array = array[0]
+    if array.ndim != 1 or array.size == 0:
+        raise BadInput(f"betas: expected shape [B], got {list(array.shape)}")
+    return array
+
+
+def _size(width: Any, height: Any) -> tuple[int, int]:
+    for value in (width, height):
+        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+            raise BadInput(f"image size: expected whole numbers of pixels, got {width!r} × {height!r}")
+    return int(width), int(height)
+
+
+def _K(K: Any, width: int, height: int, pixel_center: float) -> Array:
+    matrix = _numbers("K", K, None)
+    if matrix.size == 1:
+        f = float(matrix.reshape(()))
+        matrix, pixel_center = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]]), 0.5
+    if matrix.shape != (3, 3):
+        raise BadInput(f"K: expected shape [3, 3] or a focal length, got {list(matrix.shape)}")
+    if matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or matrix[1, 0] != 0 or not np.array_equal(matrix[2], [0, 0, 1]):
+        raise BadInput("K: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0")
+    if pixel_center not in (0.0, 0.5):
+        raise BadInput(f"pixel_center {pixel_center!r}: expected 0.0 or 0.5")
+    matrix[:2, 2] += 0.5 - pixel_center
+    return matrix
+
+
+def _check_rotations(what: str, R: Array) -> None:
+    off = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3))
+    if (off > 1e-2).any() or (np.linalg.det(R) < 0).any():
+        raise BadInput(f"{what}: expected rotations (R Rᵀ = 1, determinant 1), got another matrix")
