@@ -46,6 +46,11 @@ class CaptureFolder:
             )
         return body
 
+    @property
+    def has_model(self) -> bool:
+        """Whether `model` can be had: a stand-in's always, real data's when it was given."""
+        return self._given_body is not None or bool(self._mark)
+
     def check_index(self, camera: int, frame: int) -> None:
         """Raise `BadInput` for a camera or frame that the capture does not have."""
         if not 0 <= camera < len(self.camera_ids):

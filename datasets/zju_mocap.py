@@ -27,7 +27,7 @@ from ihbench import atomic
 from ihbench.body import Body, from_zju_root, zju_root
 from ihbench.camera import Camera
 from ihbench.datasets.capture_folder import CaptureFolder
-from ihbench.datasets.overlap import share_inside
+from ihbench.datasets.overlap import Overlap, overlap_of, overlap_problems
 from ihbench.datasets.pickles import write_object
 from ihbench.datasets.pictures import decoded, encoded, opened
 from ihbench.errors import BadInput
@@ -37,7 +37,6 @@ from ihbench.scene import BodyPose
 
 FOLDER_PREFIX = "CoreView_"
 FITS = ("new_params", "params")  # the newer one first: HumanNeRF and OccNeRF use it
-VERTICES = {"new_params": "new_vertices", "params": "vertices"}
 SILHOUETTES = {"mask": ("mask",), "mask_cihp": ("mask_cihp",), "union": ("mask", "mask_cihp")}
 CAMERA_SHAPES = {"K": (3, 3), "D": (5,), "R": (3, 3), "T": (3,)}
 JPEG_QUALITY = 95
@@ -46,27 +45,29 @@ JPEG_QUALITY = 95
 class ZjuMocap:
     """A folder that holds `CoreView_*` folders, or one of those folders itself."""
 
+    prefix = FOLDER_PREFIX
+
     def __init__(self, root: Path):
         """Raises `BadInput` when there is no such folder, or nothing of this layout in it."""
         self.root = Path(root).expanduser()
         if not self.root.is_dir():
-            raise BadInput(f"{self.root}: no such folder; give the folder that holds {FOLDER_PREFIX}* folders")
+            raise BadInput(f"{self.root}: no such folder; give the folder that holds {self.prefix}* folders")
         own_name = self.root.absolute().name  # "." may be a subject's folder
-        if own_name.startswith(FOLDER_PREFIX):
-            self._folders = {own_name.removeprefix(FOLDER_PREFIX): self.root.absolute()}
+        if own_name.startswith(self.prefix):
+            self._folders = {own_name.removeprefix(self.prefix): self.root.absolute()}
         else:
             self._folders = {
-                folder.name.removeprefix(FOLDER_PREFIX): folder
-                for folder in self.root.glob(f"{FOLDER_PREFIX}*")
-                if folder.is_dir()
+                folder.name.removeprefix(self.prefix): folder
+                for folder in self.root.glob(f"{self.prefix}*")
+                if folder.is_dir() and (self.prefix == FOLDER_PREFIX or (folder / "annots.npy").is_file())
             }
         if not self._folders:
-            raise BadInput(f"{self.root}: no {FOLDER_PREFIX}* folder in it{_where_else(self.root)}")
+            raise BadInput(f"{self.root}: no {self.prefix}* folder in it{_where_else(self.root)}")
 
     @staticmethod
-    def check(root: Path) -> dict[str, Any]:
+    def check(root: Path, body: Body | None = None) -> dict[str, Any]:
         """What this copy is and what it lacks; see `check` below."""
-        return check(root)
+        return check(ZjuMocap(root), "original")
 
     def subjects(self) -> list[str]:
         """Names without `CoreView_`, in natural order."""
@@ -80,23 +81,29 @@ class ZjuMocap:
         """
         if subject not in self._folders:
             raise BadInput(f"{self.root}: no subject {subject!r}: {nearest(subject, self.subjects())}")
-        return ZjuCapture(self._folders[subject], body)
+        return self._capture(self._folders[subject], body)
+
+    def _capture(self, folder: Path, body: Body | None) -> ZjuCapture:
+        return ZjuCapture(folder, body)
 
 
 class ZjuCapture(CaptureFolder):
     """One subject, read lazily; see `ihbench.scene.Capture`. Keeps no images."""
 
     dataset = "zju_mocap"
+    layout, prefix = "original", FOLDER_PREFIX
+    fits = FITS  # parameter folders, the preferred one first
+    mask_kinds: tuple[str, ...] = ("mask", "mask_cihp")
 
     def __init__(self, folder: Path, body: Body | None = None):
-        super().__init__(folder, folder.name.removeprefix(FOLDER_PREFIX), body)
+        super().__init__(folder, folder.name.removeprefix(self.prefix), body)
         self._annots = read_annots(folder / "annots.npy")
-        self.fit = next((name for name in FITS if (folder / name).is_dir()), None)
+        self.fit = next((name for name in self.fits if (folder / name).is_dir()), None)
         if self.fit is None:
             raise BadInput(
-                f"{folder}: neither {' nor '.join(FITS)} in it; expected SMPL parameters, one file a frame"
+                f"{folder}: neither {' nor '.join(self.fits)} in it; expected SMPL parameters, one file a frame"
             )
-        self.variant = f"original/{self.fit}"
+        self.variant = f"{self.layout}/{self.fit}"
         self.n_frames = len(self._annots.image_paths)
         self.camera_ids = self._annots.camera_ids
         self._sizes: dict[int, tuple[int, int]] = {}
@@ -121,7 +128,7 @@ class ZjuCapture(CaptureFolder):
     def vertices(self, frame: int) -> NDArray[np.float64]:
         """[V, 3] m, world: the fitted body mesh as stored."""
         assert self.fit is not None
-        path = self.folder / VERTICES[self.fit] / f"{self.number(frame)}.npy"
+        path = self.folder / vertex_folder(self.fit) / f"{self.number(frame)}.npy"
         if not path.is_file():
             raise BadInput(f"{path}: no such file; expected the body's vertices at frame {frame}")
         vertices = load_npy(path)
@@ -203,6 +210,11 @@ class ZjuCapture(CaptureFolder):
                 f"{path}: {picture.shape[1]}×{picture.shape[0]} px, but the camera's images are {width}×{height} px; "
                 f"expected one size for a camera's images and masks"
             )
+
+
+def vertex_folder(fit: str) -> str:
+    """The folder of the vertices that a parameter folder gives: new_params -> new_vertices."""
+    return fit.replace("params", "vertices")
 
 
 @dataclass(frozen=True)
@@ -350,7 +362,7 @@ def _shape_of(array: NDArray) -> str:
 # ----------------------------------------------------------------------------------------------- check
 
 
-def check(root: Path, samples: int = 3) -> dict[str, Any]:
+def check(dataset: ZjuMocap, layout: str, samples: int = 3) -> dict[str, Any]:
     """What this copy is and what it lacks, for `ihbench data check`.
 
     Lists folders and decodes `samples` frames of two cameras a subject; it does not decode everything. Raises
@@ -358,11 +370,10 @@ def check(root: Path, samples: int = 3) -> dict[str, Any]:
     `vertices_in_mask` is the share of body vertices that project into the person's silhouette (grown by 1 % of the
     image's width), over the sampled images: well below 0.95 means wrong cameras, units or parameters.
     """
-    dataset = ZjuMocap(root)
     subjects = [_check_subject(dataset, name, samples) for name in dataset.subjects()]
     return {
         "dataset": ZjuCapture.dataset,
-        "layout": "original",
+        "layout": layout,
         "root": str(dataset.root),
         "standin": next((subject["standin"] for subject in subjects if subject.get("standin")), ""),
         "subjects": subjects,
@@ -380,17 +391,17 @@ def _check_subject(dataset: ZjuMocap, name: str, samples: int) -> dict[str, Any]
         return found
     n_cameras, n_frames = len(capture.camera_ids), capture.n_frames
     pairs = [(camera, frame) for camera in range(n_cameras) for frame in range(n_frames)]
-    kinds = ("image", "mask", "mask_cihp")
+    kinds = ("image", *capture.mask_kinds)
     present: dict[str, set[tuple[int, int]]] = {}
     for kind in kinds:
         path_of = capture.image_path if kind == "image" else lambda c, f, kind=kind: capture.mask_path(c, f, kind)
         listed = _listing({path_of(camera, 0).parent for camera in range(n_cameras)})
         present[kind] = {pair for pair in pairs if path_of(*pair) in listed}
-    params = _listing({capture.folder / fit for fit in FITS} | {capture.folder / VERTICES[fit] for fit in FITS})
+    params = _listing({capture.folder / part for part in (*capture.fits, *map(vertex_folder, capture.fits))})
     numbers = [f"{capture.number(frame)}.npy" for frame in range(n_frames)]
     assert capture.fit is not None
     missing = {kind: len(pairs) - len(present[kind]) for kind in kinds}
-    for part in (capture.fit, VERTICES[capture.fit]):
+    for part in (capture.fit, vertex_folder(capture.fit)):
         missing[part] = sum(capture.folder / part / number not in params for number in numbers)
     found |= {
         "standin": capture.standin,
@@ -419,9 +430,8 @@ def _sample(
     capture: ZjuCapture, complete: list[tuple[int, int]], samples: int, found: dict[str, Any], problems: list[str]
 ) -> None:
     """Decode a few images of the first and last camera, and project the body into their masks."""
-    from scipy.ndimage import binary_dilation
-
-    inside, sizes, decoded = [], set(), 0
+    overlaps: list[Overlap] = []
+    sizes, decoded_images = set(), 0
     for camera in sorted({complete[0][0], complete[-1][0]}):
         frames = [frame for other, frame in complete if other == camera]
         for frame in sorted({frames[i] for i in np.linspace(0, len(frames) - 1, samples).astype(int)}):
@@ -434,17 +444,13 @@ def _sample(
             except BadInput as error:
                 problems.append(str(error))
                 continue
-            decoded += 1
-            grown = binary_dilation(silhouette, iterations=max(1, silhouette.shape[1] // 100))
-            inside.append(share_inside(points, np.asarray(grown, bool)))
-    found["sampled_images"] = decoded
+            decoded_images += 1
+            overlaps.append(overlap_of(points, silhouette))
+    found["sampled_images"] = decoded_images
     found["image_size"] = sorted([list(size) for size in sizes])
-    if inside:
-        share = found["vertices_in_mask"] = round(float(np.mean(inside)), 4)
-        if share < 0.95:
-            problems.append(
-                f"only {share:.0%} of the body's vertices project into the silhouettes; expected over 95 %"
-            )
+    if overlaps:
+        found["vertices_in_mask"] = round(float(np.mean([o.inside for o in overlaps])), 4)
+        problems += overlap_problems(overlaps)
 
 
 # ----------------------------------------------------------------------------------------------- write
@@ -498,4 +504,4 @@ def write_vertices(folder: Path, number: int, vertices: NDArray[np.floating], fi
     """The frame's vertex file: [V, 3] m, world, float32."""
     buffer = io.BytesIO()
     np.save(buffer, np.asarray(vertices, np.float32))
-    atomic.write_bytes(folder / VERTICES[fit] / f"{number}.npy", buffer.getvalue(), durable=False)
+    atomic.write_bytes(folder / vertex_folder(fit) / f"{number}.npy", buffer.getvalue(), durable=False)

@@ -17,6 +17,7 @@ COMMANDS = {
     "plan": "what a run would do, what it leaves out and why; runs nothing",
     "data": "check a data folder, or write a stand-in capture",
     "score": "score a folder of images that somebody else's code rendered",
+    "prepare": "hand out the occluded training set for other people's code",
     "report": "tables of finished runs",
     "metrics": "check every metric against oracles, other libraries and stored values",
     "weights": "learned weights the bench may not ship: list, where, fetch",

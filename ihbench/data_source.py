@@ -96,21 +96,37 @@ def standin_root(dataset: str) -> Path:
 def open_capture(dataset: str, root: Path, scene: str, body: Path | None) -> tuple[Capture, Body]:
     """Open one capture with the body its poses belong to.
 
-    The bench's own body for stand-ins; for real data the SMPL file at `body` or `IHBENCH_BODY`. Raises `BadInput`
-    when that is missing.
+    The bench's own body for stand-ins, the capture's own where its folder holds one; else the SMPL file at `body` or
+    `IHBENCH_BODY`, which may be a folder with a file for each gender. Raises `BadInput` when that is missing.
     """
     source = registry.load("dataset", dataset)(root)
     capture = source.open(scene)
-    if capture.body == "procedural":
-        return capture, load_body()
+    if capture.body in ("procedural", "own"):
+        return capture, capture.model
     named = own_body(body)
     if named is None:
         raise BadInput(
             f"{dataset} {scene}: its poses need the SMPL model file (SMPL_NEUTRAL.pkl, from smpl.is.tue.mpg.de); "
             f"name it with --body or IHBENCH_BODY"
         )
-    model = load_body(named)
+    model = load_body(body_file(named, getattr(capture, "gender", "neutral")))
     return source.open(scene, body=model), model
+
+
+def body_file(named: Path, gender: str) -> Path:
+    """The SMPL file itself, or of a folder of them the one of this gender (neutral where there is no such file).
+
+    Known names: SMPL_MALE.pkl and its like, basicModel_m_lbs_10_207_0_v1.0.0.pkl. Raises `BadInput` for a folder
+    without either.
+    """
+    if not named.is_dir():
+        return named
+    for wanted in (gender, "neutral"):
+        for pattern in (f"smpl_{wanted}.", f"basicmodel_{wanted}_", f"basicmodel_{wanted[0]}_"):
+            for path in sorted(named.iterdir()):
+                if path.name.lower().startswith(pattern) and path.suffix in (".pkl", ".npz"):
+                    return path
+    raise BadInput(f"{named}: no SMPL file for gender {gender!r} in it; expected SMPL_{gender.upper()}.pkl")
 
 
 def wanted_frames(protocol: Protocol, standin: type) -> dict[int, list[int]]:

@@ -13,7 +13,6 @@ from ihbench import registry
 from ihbench.protocol import OcclusionRule, Protocol
 from ihbench.scene import Capture
 
-
 Mask = NDArray[np.bool_]
 
 

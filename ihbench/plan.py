@@ -80,7 +80,7 @@ def measure_scene(capture: Capture, protocol: Protocol, body: Body) -> SceneMeas
     poses = np.stack([capture.body_pose(frame).pose for frame in frames])
     camera = views[0].camera
     depth = float(np.median([camera.to_camera(body.posed_joints(view.body_pose))[:, 2].mean() for view in views]))
-    focal = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1])) 
+    focal = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
     focal *= protocol.image.size / max(camera.width, camera.height)
     corners = body.pose(views[0].body_pose)[body.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2

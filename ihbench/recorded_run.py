@@ -103,6 +103,7 @@ def about_scene(capture: Capture, protocol: Protocol) -> dict[str, Any]:
     return {
         "standin": capture.standin,
         "variant": capture.variant,
+        "body": capture.body,
         "headline": protocol.headline,
         "protocol": protocol.content,
     }

@@ -19,6 +19,7 @@ GROUPS = {
     "config": "ihbench.configs",
     "dataset": "ihbench.datasets",
     "stand-in": "ihbench.standins",
+    "training layout": "ihbench.training_layouts",
     "protocol": "ihbench.protocols",
     "occlusion": "ihbench.occlusions",
     "report": "ihbench.reports",

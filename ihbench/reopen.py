@@ -18,12 +18,19 @@ if TYPE_CHECKING:
     from ihbench.body import Body
 
 
-def reopen_body(folder: Path, body: Path | None) -> Body:
+def reopen_body(folder: Path, data: Path | None, body: Path | None) -> Body:
     """The body model of a run's poses. Raises `BadInput` when the run needs an SMPL file and none is named."""
-    standin = RunFolder.open(folder).record["about"]["standin"]
-    if not standin and own_body(body) is None:
+    about = RunFolder.open(folder).record["about"]
+    if about["standin"]:
+        return load_body()
+    if about.get("body") == "own":
+        return reopen_capture(folder, data, body).model
+    named = own_body(body)
+    if named is None:
         raise BadInput(f"{folder}: was made on real data; name the SMPL model file with --body or IHBENCH_BODY")
-    return load_body(None if standin else own_body(body))
+    if named.is_dir():
+        return reopen_capture(folder, data, body).model
+    return load_body(named)
 
 
 def reopen_capture(folder: Path, data: Path | None, body: Path | None) -> Capture:
@@ -65,4 +72,4 @@ def reopen_scene(folder: Path, data: Path | None, body: Path | None) -> tuple[Oc
         raise BadInput(
             f"{folder}: the data of {capture.name} are not those that the run was made on; name its --data"
         )
-    return open_scene(capture, protocol), reopen_body(folder, body)
+    return open_scene(capture, protocol), reopen_body(folder, data, body)

@@ -147,7 +147,7 @@ def load_avatar(folder: Path, data: Path | None, body: Path | None) -> tuple[Any
     record = RunFolder.open(folder).record
     if not (folder / "avatar").is_dir():
         raise BadInput(f"{folder}: has no avatar (status {record['status']}); finish the run first")
-    identity, model = record["identity"], reopen_body(folder, body)
+    identity, model = record["identity"], reopen_body(folder, data, body)
     method: Method = registry.load("method", identity["method"])(
         configuration(identity["method"], identity["profile"], {})
     )

@@ -3,6 +3,9 @@
 A pickle is a program. This reader executes it with nothing to call but a handful of functions of its own, which can
 only build plain Python values and numpy arrays of numbers, text or objects. chumpy and scipy.sparse objects, which
 old SMPL files hold, come back as inert `ForeignObject`s that carry their state.
+
+Nor can a small file keep the reader or its caller busy: what shared references multiply is counted and bounded,
+keys are looked at before they are hashed, and nothing is allocated that the file does not hold.
 """
 
 from __future__ import annotations
@@ -67,6 +70,20 @@ class _NdarrayClass:
     """What the name `numpy.ndarray` becomes: a token for `_reconstruct`, nothing that can be called."""
 
 
+def _check_key(key: object) -> None:
+    """Hashing a tuple takes time and C stack for everything below it: only small ones may be keys."""
+    if type(key) in _LEAF_TYPES:
+        return
+    waiting, parts = [key], 0
+    while waiting:
+        part = waiting.pop()
+        parts += 1
+        if isinstance(part, tuple) and parts + len(waiting) + len(part) <= _KEY_PARTS:
+            waiting.extend(part)
+        elif not isinstance(part, _KEY_TYPES):
+            raise pickle.UnpicklingError("refused a key that is not plain, or too large")
+
+
 def _reconstruct(cls: object, _shape: object, _typecode: object) -> _ArrayRecord:
     if cls is not _NDARRAY:
         raise pickle.UnpicklingError("refused an array of another class than numpy.ndarray")
@@ -95,7 +112,7 @@ def _reconstructor(cls: type, _base: object, _state: object) -> ForeignObject:
 
 def _encode(text: str, encoding: str = "latin1") -> bytes:
     if encoding not in ("latin1", "latin-1"):
-        raise pickle.UnpicklingError(f"refused text encoding {encoding!r}")
+        raise pickle.UnpicklingError("refused a text encoding that is not latin1")
     return text.encode("latin1")
 
 
@@ -107,12 +124,16 @@ def _empty_bytes() -> bytes:
 def _set(items: list | tuple = ()) -> set:
     if not isinstance(items, list | tuple):
         raise pickle.UnpicklingError("refused a set of something that is not a list")
+    for item in items:
+        _check_key(item)
     return set(items)
 
 
 def _ordered_dict(pairs: list | tuple = ()) -> dict:
     if not isinstance(pairs, list | tuple):
         raise pickle.UnpicklingError("refused a dictionary of something that is not a list")
+    for key, _value in pairs:
+        _check_key(key)
     return {key: value for key, value in pairs}
 
 
@@ -137,6 +158,14 @@ _ALLOWED: dict[tuple[str, str], object] = {
 }
 _INERT_PACKAGES = ("chumpy", "scipy.sparse")
 
+# What shared references may multiply. Honest files stay far below: they share little.
+_COPIED_BYTES, _COPIED_BYTES_A_FILE_BYTE = 2**20, 64
+_EXPANDED_VALUES, _EXPANDED_A_STORED_ONE = 10**6, 100
+_BYTES_AN_ITEM, _BYTES_A_CLASS = 64, 2000
+_KEY_PARTS = 1000
+_LEAF_TYPES = frozenset((float, int, str, bytes, bool, type(None)))
+_KEY_TYPES = (str, bytes, int, float, complex, type(None), np.generic, frozenset, ForeignObject)
+
 
 def _as_bytes(data: object) -> bytes | bytearray:
     """Raw array bytes; a python-2 pickle read as latin1 hands them over as text."""
@@ -152,21 +181,72 @@ def _as_bytes(data: object) -> bytes | bytearray:
 _PythonUnpickler: Any = pickle._Unpickler  # pyright: ignore[reportAttributeAccessIssue]
 
 
+def _checking_keys(opcode: bytes, step: int) -> Callable:
+    """The opcode that hashes every `step`-th item above the mark, with a look at those before."""
+    plain = _PythonUnpickler.dispatch[opcode[0]]
+
+    def load(self: SafeUnpickler) -> None:
+        for key in self.stack[::step]:
+            _check_key(key)
+        plain(self)
+
+    return load
+
+
 class SafeUnpickler(_PythonUnpickler):
     """An unpickler that can only build plain values, numpy arrays and `ForeignObject`s."""
 
     dispatch: ClassVar[dict[int, Callable]] = dict(_PythonUnpickler.dispatch)
 
+    def __init__(self, data: io.BytesIO, **options: Any):
+        super().__init__(data, **options)
+        self._allowance = _COPIED_BYTES + _COPIED_BYTES_A_FILE_BYTE * data.getbuffer().nbytes
+        self._foreign: dict[tuple[str, str], type] = {}
+
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) in _ALLOWED:
             return _ALLOWED[module, name]
         if any(module == package or module.startswith(package + ".") for package in _INERT_PACKAGES):
-            return type(name, (ForeignObject,), {"kind": f"{module}.{name}"})
+            if (module, name) not in self._foreign:
+                self._spend(_BYTES_A_CLASS)
+                self._foreign[module, name] = type(name, (ForeignObject,), {"kind": f"{module}.{name}"})
+            return self._foreign[module, name]
         raise pickle.UnpicklingError(f"refused: the file asks for {module}.{name}")
 
     def load(self) -> Any:
         """The value in the pickle, with real numpy arrays in it."""
-        return _resolve(super().load(), {})
+        value = _resolve(super().load(), {}, self._spend)
+        _check_expansion(value)
+        return value
+
+    def _spend(self, size: int) -> None:
+        """Count bytes that are about to be copied from what the file may name again and again."""
+        self._allowance -= size
+        if self._allowance < 0:
+            raise pickle.UnpicklingError("refused: a small file that grows too large")
+
+    def _spend_on(self, value: object) -> None:
+        if isinstance(value, str | bytes | bytearray):
+            self._spend(len(value))
+        elif isinstance(value, list | tuple | dict | set | frozenset):
+            self._spend(_BYTES_AN_ITEM * len(value))
+
+    def _load_reduce(self) -> None:
+        """A call gets a copy of its arguments, and some of what can be called copies them again."""
+        arguments = self.stack[-1]
+        self._spend_on(arguments)
+        if isinstance(arguments, tuple):
+            for argument in arguments:
+                self._spend_on(argument)
+        _PythonUnpickler.load_reduce(self)
+
+    def _load_newobj(self) -> None:
+        self._spend_on(self.stack[-1])
+        _PythonUnpickler.load_newobj(self)
+
+    def _load_setitem(self) -> None:
+        _check_key(self.stack[-2])
+        _PythonUnpickler.load_setitem(self)
 
     def _refuse(self) -> None:
         raise pickle.UnpicklingError("refused: an opcode that no data file needs")
@@ -178,8 +258,9 @@ class SafeUnpickler(_PythonUnpickler):
         if isinstance(target, _ArrayRecord | _DtypeRecord):
             target.set_state(state)
         elif isinstance(target, ForeignObject):
-            for part in state if isinstance(state, tuple) else (state,):
+            for part in state[:2] if isinstance(state, tuple) else (state,):  # attributes, then slots
                 if isinstance(part, dict):
+                    self._spend_on(part)
                     target.state.update(part)
         else:
             raise pickle.UnpicklingError(f"refused to change a {type(target).__name__}")
@@ -193,43 +274,53 @@ class SafeUnpickler(_PythonUnpickler):
 
     dispatch[pickle.BUILD[0]] = _load_build
     dispatch[pickle.BYTEARRAY8[0]] = _load_bytearray8
+    dispatch[pickle.REDUCE[0]] = _load_reduce
+    dispatch[pickle.NEWOBJ[0]] = _load_newobj
+    dispatch[pickle.SETITEM[0]] = _load_setitem
+    for _opcode, _step in ((pickle.SETITEMS, 2), (pickle.DICT, 2), (pickle.ADDITEMS, 1), (pickle.FROZENSET, 1)):
+        dispatch[_opcode[0]] = _checking_keys(_opcode, _step)
     for _opcode in (
         *(pickle.EXT1, pickle.EXT2, pickle.EXT4),
-        *(pickle.PERSID, pickle.BINPERSID, pickle.NEXT_BUFFER, pickle.READONLY_BUFFER),
+        *(pickle.PERSID, pickle.BINPERSID, pickle.NEXT_BUFFER, pickle.READONLY_BUFFER, pickle.NEWOBJ_EX),
     ):
         dispatch[_opcode[0]] = _refuse
 
 
-def _resolve(value: Any, done: dict[int, tuple[Any, Any]]) -> Any:
+_UNFINISHED: Any = object()
+
+
+def _resolve(value: Any, done: dict[int, tuple[Any, Any]], spend: Callable[[int], None]) -> Any:
     """Replace the array records in a value by arrays. `done` maps id -> (original, result), so that a value shared in
     many places is visited once; it holds the original, too, to keep its id taken."""
-    if not isinstance(value, list | dict | tuple | set | _ArrayRecord | _DtypeRecord | ForeignObject):
+    if not isinstance(value, list | dict | tuple | _ArrayRecord | _DtypeRecord | ForeignObject):
         if isinstance(value, type) or callable(value) or isinstance(value, _NdarrayClass):
             raise pickle.UnpicklingError("expected data, found a function")
         return value
     if id(value) in done:
+        if done[id(value)][1] is _UNFINISHED:
+            raise pickle.UnpicklingError("refused an array or a tuple that holds itself")
         return done[id(value)][1]
-    done[id(value)] = (value, value)
+    done[id(value)] = (value, _UNFINISHED if isinstance(value, tuple | _ArrayRecord) else value)
     if isinstance(value, list):
-        value[:] = [_resolve(item, done) for item in value]
+        value[:] = [_resolve(item, done, spend) for item in value]
     elif isinstance(value, dict):
         for key in value:
-            value[key] = _resolve(value[key], done)
+            value[key] = _resolve(value[key], done, spend)
     elif isinstance(value, ForeignObject):
-        _resolve(value.state, done)
+        _resolve(value.state, done, spend)
     elif isinstance(value, tuple):
-        done[id(value)] = (value, tuple(_resolve(item, done) for item in value))
+        done[id(value)] = (value, tuple([_resolve(item, done, spend) for item in value]))
     elif isinstance(value, _ArrayRecord):
-        done[id(value)] = (value, _build_array(value, done))
+        done[id(value)] = (value, _build_array(value, done, spend))
     elif isinstance(value, _DtypeRecord):
         done[id(value)] = (value, value.resolve())
     return done[id(value)][1]
 
 
-def _build_array(record: _ArrayRecord, done: dict[int, tuple[Any, Any]]) -> np.ndarray:
+def _build_array(record: _ArrayRecord, done: dict[int, tuple[Any, Any]], spend: Callable[[int], None]) -> np.ndarray:
     shape, dtype_record, fortran, data = record.state
-    if not isinstance(shape, tuple) or not all(type(n) is int and n >= 0 for n in shape):
-        raise pickle.UnpicklingError(f"an array has shape {shape!r}")
+    if not isinstance(shape, tuple) or not all(type(n) is int and 0 <= n < 2**63 for n in shape) or len(shape) > 32:
+        raise pickle.UnpicklingError("the shape of an array is not a few whole numbers")
     if not isinstance(dtype_record, _DtypeRecord):
         raise pickle.UnpicklingError("an array has no numpy dtype")
     dtype = dtype_record.resolve()
@@ -238,18 +329,50 @@ def _build_array(record: _ArrayRecord, done: dict[int, tuple[Any, Any]]) -> np.n
     if dtype.hasobject:
         if not isinstance(data, list) or len(data) != count:
             raise pickle.UnpicklingError(f"an object array of shape {shape} does not hold {count} objects")
+        spend(8 * count)
         flat = np.empty(count, object)
         for i, item in enumerate(data):
-            flat[i] = _resolve(item, done)
+            flat[i] = _resolve(item, done, spend)
         return flat.reshape(shape, order=order)
+    spend(len(data) if isinstance(data, str) else 0)
     raw = _as_bytes(data)
-    if len(raw) != count * dtype.itemsize:
+    if len(raw) != count * dtype.itemsize or (count and not dtype.itemsize):
         raise pickle.UnpicklingError(
             f"an array of shape {shape} and {dtype} needs {count * dtype.itemsize} bytes, the file has {len(raw)}"
         )
-    array = np.frombuffer(raw, dtype, count) if count and dtype.itemsize else np.zeros(count, dtype)
+    spend(len(raw))
+    array = np.frombuffer(raw, dtype, count) if count else np.zeros(0, dtype)
     native = dtype.newbyteorder("=")
     return np.array(array.reshape(shape, order=order), dtype=native, order=order)
+
+
+def _check_expansion(value: Any) -> None:
+    """Refuse a few values that refer to each other so often that walking through them would never end."""
+    sizes: dict[int, int] = {}  # id of a container -> values in it, shared ones counted wherever they occur
+    stored = 0
+
+    def expanded(value: Any) -> int:
+        nonlocal stored
+        if type(value) in _LEAF_TYPES:
+            return 1
+        if isinstance(value, list | tuple | set | frozenset):
+            parts: Any = value
+        elif isinstance(value, dict):
+            parts = value.values()
+        elif isinstance(value, ForeignObject):
+            parts = value.state.values()
+        elif isinstance(value, np.ndarray) and value.dtype.hasobject:
+            parts = value.ravel().tolist()
+        else:
+            return 1
+        if id(value) not in sizes:
+            sizes[id(value)] = 1  # a value that holds itself counts once
+            stored += len(parts)
+            sizes[id(value)] += sum([expanded(part) for part in parts])
+        return sizes[id(value)]
+
+    if expanded(value) > _EXPANDED_VALUES + _EXPANDED_A_STORED_ONE * stored:
+        raise pickle.UnpicklingError("refused: a few values, referred to so often that they stand for too many")
 
 
 def _unpickle(stream: io.BufferedIOBase, path: Path) -> Any:
@@ -260,7 +383,7 @@ def _unpickle(stream: io.BufferedIOBase, path: Path) -> Any:
         return SafeUnpickler(data, encoding="latin1").load()
     except Exception as error:
         # a broken or hostile program can fail in any way: what is on the stack need not be what an opcode expects
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = " ".join(str(error)[:200].split()) or type(error).__name__
         raise BadInput(
             f"{path}: cannot be read as a pickle of plain data ({reason}); expected an untouched, complete file"
         ) from None
@@ -297,7 +420,7 @@ def load_npy(path: str | Path) -> np.ndarray:
                 f"{path}: truncated, its header promises {count * dtype.itemsize} bytes of {dtype} {shape} "
                 f"and {len(data)} follow; copy the file again"
             )
-    array = np.frombuffer(data, dtype, count) if count and dtype.itemsize else np.zeros(count, dtype)
+    array = np.frombuffer(data, dtype, count) if count else np.zeros(0, dtype)
     return array.reshape(shape, order="F" if fortran else "C").copy(order="K")
 
 
@@ -306,10 +429,17 @@ def _read_npy_header(stream: io.BufferedIOBase, path: Path) -> tuple[tuple[int, 
         (1, 0): np.lib.format.read_array_header_1_0,
         (2, 0): np.lib.format.read_array_header_2_0,
     }
+    damaged = f"{path}: not a numpy .npy file, or its header is damaged; copy the file again"
     try:
-        return readers[np.lib.format.read_magic(stream)](stream)
-    except (ValueError, KeyError, EOFError):
-        raise BadInput(f"{path}: not a numpy .npy file, or its header is damaged; copy the file again") from None
+        shape, fortran, dtype = readers[np.lib.format.read_magic(stream)](stream)
+    except Exception:  # numpy lets the header's parser fail in its own ways: TokenError, MemoryError, TypeError, …
+        raise BadInput(damaged) from None
+    sound = len(shape) <= 32 and all(type(n) is int and 0 <= n < 2**63 for n in shape)
+    if not sound or dtype.subdtype is not None or (dtype.itemsize == 0 and math.prod(shape)):
+        raise BadInput(damaged)
+    if math.prod(shape) == 0 and math.prod(n for n in shape if n) * max(1, dtype.itemsize) >= 2**63:
+        raise BadInput(damaged)  # numpy makes no such array, empty or not
+    return shape, fortran, dtype
 
 
 def _open(path: Path) -> io.BufferedReader:

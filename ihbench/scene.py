@@ -129,8 +129,9 @@ class Dataset(Protocol):
     def __init__(self, root: Path): ...
 
     @staticmethod
-    def check(root: Path) -> dict[str, Any]:
-        """What a folder holds and lacks, as plain data with a boolean "ok". Raises `BadInput` for another layout."""
+    def check(root: Path, body: Body | None = None) -> dict[str, Any]:
+        """What a folder holds and lacks, as plain data with a boolean "ok"; with a body model also whether its poses
+        fit the masks. Raises `BadInput` for another layout."""
         ...
 
     def subjects(self) -> list[str]: ...

@@ -22,7 +22,8 @@ from ihbench.scene import BodyPose
 
 Array = NDArray[np.float64]
 
-N_FRAMES = 570
+N_FRAMES = 570  # of the exercises that a ZJU-MoCap stand-in shows
+NOVEL_FRAMES = 120  # and of the movements after them, which the protocol `novel_pose` tests on
 FRAMES_PER_SECOND = 30
 CROSSFADE = 36  # frames from one exercise to the next
 SMPL_UP_TO_WORLD_UP = Rotation.from_euler("x", 90, degrees=True)  # y up, facing +z -> z up, facing -y
@@ -38,16 +39,69 @@ class Performance:
     exercises: tuple[str, ...]
 
 
-def perform(rng: np.random.Generator, exercises: tuple[str, ...], full_turn: bool) -> Performance:
-    """A sequence of `N_FRAMES` frames: the exercises one after the other while the person turns.
+def perform(
+    rng: np.random.Generator, exercises: tuple[str, ...], full_turn: bool, n_frames: int = N_FRAMES
+) -> Performance:
+    """A sequence of frames: the exercises one after the other while the person turns.
 
     `full_turn` people make one to two turns; the others look around through 60–200°.
     """
-    yaw = _turning(rng, full_turn)
-    pose = _blend([EXERCISES[name](_phase(rng)) for name in exercises])
-    pose = pose + _stepping(yaw) + _restlessness(rng)
+    yaw = _turning(rng, full_turn, n_frames)
+    pose = _blend([EXERCISES[name](_phase(rng, n_frames)) for name in exercises])
+    pose = pose + _stepping(yaw) + _restlessness(rng, n_frames)
     pose = gaussian_filter1d(pose, 1.5, axis=0, mode="nearest")
-    return Performance(pose, yaw, _drift(rng), exercises)
+    return Performance(pose, yaw, _drift(rng, n_frames), exercises)
+
+
+def turntable(rng: np.random.Generator, n_frames: int, turns: float) -> Performance:
+    """An A-pose that turns on the spot before a camera at -y, as PeopleSnapshot's subjects do; it starts facing it.
+
+    Arms and weight move a little, as nobody stands quite still.
+    """
+    t = np.linspace(0, 1, n_frames)
+    sway = np.sin(2 * np.pi * (3 * t + rng.uniform()))
+    yaw = 2 * np.pi * turns * t + np.deg2rad(4) * sway * np.minimum(1, 20 * t)
+    phase = 2 * np.pi * 2 * t
+    pose = _standing(phase)
+    lift = 12 + 5 * np.sin(phase + rng.uniform(0, 2 * np.pi))
+    _turn_both(pose, "shoulder", z=lift)
+    pose = pose + _stepping(yaw) + 0.5 * _restlessness(rng, n_frames)
+    return Performance(
+        gaussian_filter1d(pose, 1.5, axis=0, mode="nearest"), yaw, np.zeros((n_frames, 2)), ("a_pose",)
+    )
+
+
+def stroll(rng: np.random.Generator, n_frames: int, reach: float) -> Performance:
+    """Walking to and fro along x over `reach` m to either side, stopping in the middle to reach out, as in a room
+    with furniture. The person looks where they go, and to -y while reaching."""
+    t = np.linspace(0, 1, n_frames)
+    side = rng.choice([-1, 1])
+    # out, reach, on, and back a little
+    knots, places = [0, 0.38, 0.62, 0.9, 1], reach * np.array([-1, 0, 0, 1, 0.8])
+    place = np.zeros((n_frames, 2))
+    place[:, 0] = side * gaussian_filter1d(np.interp(t, knots, places), 3, mode="nearest")
+    place[:, 1] = 0.1 * np.sin(2 * np.pi * t + rng.uniform(0, 2 * np.pi))
+    going = np.gradient(place[:, 0])
+    walking = gaussian_filter1d((np.abs(going) > 0.006).astype(float), 3, mode="nearest")
+    heading = np.interp(t, [0, 0.34, 0.4, 0.6, 0.66, 0.9, 0.97, 1], np.pi / 2 * np.array([1, 1, 0, 0, 1, 1, 0, -0.6]))
+    stride = np.cumsum(np.abs(going)) * 2 * np.pi / 1.25  # a double step of 1.25 m
+    pose = _standing(stride)
+    for s, lead in ((1, "left"), (-1, "right")):
+        swing = s * np.sin(stride) * walking
+        _turn(pose, f"{lead}_hip", x=-26 * swing)
+        _turn(pose, f"{lead}_knee", x=walking * 28 * np.maximum(0, s * np.cos(stride)) ** 1.5)
+        _turn(pose, f"{lead}_ankle", x=6 * swing)
+        _turn(pose, f"{lead}_shoulder", y=s * 24 * swing)
+    out = np.exp(-(((t - 0.5) / 0.07) ** 2))
+    hand = "left" if rng.random() < 0.5 else "right"
+    sign = 1 if hand == "left" else -1
+    _turn(pose, f"{hand}_shoulder", y=-sign * 62 * out, z=sign * 40 * out)
+    _turn(pose, f"{hand}_elbow", y=sign * 10 * out)
+    _turn(pose, "spine1", x=14 * out)
+    _turn(pose, "spine2", x=10 * out)
+    pose = pose + 0.6 * _restlessness(rng, n_frames)
+    yaw = side * gaussian_filter1d(heading, 2, mode="nearest")
+    return Performance(gaussian_filter1d(pose, 1.2, axis=0, mode="nearest"), yaw, place, ("walk", "reach"))
 
 
 def body_poses(performance: Performance, betas: Array, body: Body) -> list[BodyPose]:
@@ -92,28 +146,29 @@ def _planted(feet: Array) -> Array:
     return path - gaussian_filter1d(path, 75, axis=0, mode="nearest")
 
 
-def _phase(rng: np.random.Generator) -> Array:
+def _phase(rng: np.random.Generator, n_frames: int) -> Array:
     """[T] rad: repetitions of 1.7–2.4 s, never quite the same length."""
     frames = FRAMES_PER_SECOND * rng.uniform(1.7, 2.4)
-    uneven = gaussian_filter1d(rng.normal(size=N_FRAMES), 40, mode="wrap")
+    uneven = gaussian_filter1d(rng.normal(size=n_frames), 40, mode="wrap")
     rate = (1 + 0.12 * uneven / uneven.std()) * 2 * np.pi / frames
     return np.cumsum(rate)
 
 
 def _blend(clips: list[Array]) -> Array:
     """[T, 24, 3]: equal shares of the sequence for each clip, with smooth crossfades."""
-    t = np.arange(N_FRAMES)
+    n_frames = len(clips[0])
+    t = np.arange(n_frames)
     out = clips[0].copy()
     for k, clip in enumerate(clips[1:], 1):
-        x = np.clip((t - N_FRAMES * k / len(clips)) / CROSSFADE + 0.5, 0, 1)
+        x = np.clip((t - n_frames * k / len(clips)) / CROSSFADE + 0.5, 0, 1)
         share = x * x * (3 - 2 * x)
         out += share[:, None, None] * (clip - out)
     return out
 
 
-def _turning(rng: np.random.Generator, full_turn: bool) -> Array:
+def _turning(rng: np.random.Generator, full_turn: bool, n_frames: int) -> Array:
     """[T] rad of heading."""
-    t = np.linspace(0, 1, N_FRAMES)
+    t = np.linspace(0, 1, n_frames)
     start = rng.uniform(0, 2 * np.pi)
     if full_turn:
         turns = rng.uniform(1.1, 2.0) * rng.choice([-1, 1])
@@ -127,9 +182,9 @@ def _turning(rng: np.random.Generator, full_turn: bool) -> Array:
     return start + reach * (swing - swing.min()) / np.ptp(swing)
 
 
-def _drift(rng: np.random.Generator) -> Array:
+def _drift(rng: np.random.Generator, n_frames: int) -> Array:
     """[T, 2] m: nobody stays on the mark; 8–18 cm off it at the most."""
-    t = np.linspace(0, 2 * np.pi, N_FRAMES)
+    t = np.linspace(0, 2 * np.pi, n_frames)
     reach = rng.uniform(0.08, 0.18)
     rate, offset = rng.uniform(0.6, 1.4, 2), rng.uniform(0, 2 * np.pi, 2)
     return reach * np.stack([np.sin(rate[0] * t + offset[0]), np.sin(rate[1] * t + offset[1])], 1) / np.sqrt(2)
@@ -149,10 +204,10 @@ def _stepping(yaw: Array) -> Array:
     return pose
 
 
-def _restlessness(rng: np.random.Generator) -> Array:
+def _restlessness(rng: np.random.Generator, n_frames: int) -> Array:
     """[T, 24, 3]: slow sway of trunk, head and collars."""
-    t = np.linspace(0, 2 * np.pi, N_FRAMES)
-    pose = _still(N_FRAMES)
+    t = np.linspace(0, 2 * np.pi, n_frames)
+    pose = _still(n_frames)
     for joint, amount in (("pelvis", 1.5), ("spine1", 2.0), ("spine2", 2.0), ("neck", 3.0), ("head", 5.0)):
         rate, offset = rng.integers(2, 6, 3), rng.uniform(0, 2 * np.pi, 3)
         x, y, z = amount * rng.uniform(0.4, 1, 3)[:, None] * np.sin(rate[:, None] * t + offset[:, None])
@@ -286,6 +341,46 @@ def _punch(phase: Array) -> Array:
     return pose
 
 
+def _march(phase: Array) -> Array:
+    """Knees high in turn, the opposite arm bent forwards."""
+    pose = _standing(phase)
+    for side, other, lift in (("left", "right", np.sin(phase)), ("right", "left", -np.sin(phase))):
+        lift = np.maximum(lift, 0) ** 1.3
+        sign = 1 if other == "left" else -1
+        _turn(pose, f"{side}_hip", x=-84 * lift)
+        _turn(pose, f"{side}_knee", x=96 * lift)
+        _turn(pose, f"{other}_shoulder", y=-sign * 58 * lift, z=sign * 8 * lift)
+        _turn(pose, f"{other}_elbow", y=-sign * 74 * lift)
+    return pose
+
+
+def _lunge(phase: Array) -> Array:
+    """One foot far ahead, the hips low, both arms out at the sides."""
+    down = (0.5 - 0.5 * np.cos(phase)) ** 1.2
+    pose = _standing(phase)
+    _turn(pose, "left_hip", x=-62 * down)
+    _turn(pose, "left_knee", x=66 * down)
+    _turn(pose, "right_hip", x=34 * down)
+    _turn(pose, "right_knee", x=34 * down)
+    _turn(pose, "right_ankle", x=16 * down)
+    _turn_both(pose, "shoulder", z=58 * down)
+    return pose
+
+
+def _bow(phase: Array) -> Array:
+    """Bending forwards from the hips with the arms crossed before the chest."""
+    down = (0.5 - 0.5 * np.cos(phase)) ** 1.4
+    pose = _standing(phase)
+    _turn_both(pose, "hip", x=-40 * down)
+    _turn(pose, "pelvis", x=38 * down)
+    _turn(pose, "spine1", x=16 * down)
+    _turn(pose, "spine2", x=12 * down)
+    _turn(pose, "neck", x=-14 * down)
+    _turn_both(pose, "shoulder", y=-52 * down, z=6 * down)
+    _turn_both(pose, "elbow", y=-78 * down)
+    return pose
+
+
 EXERCISES: dict[str, Callable[[Array], Array]] = {
     "arm_swing": _arm_swing,
     "kick": _kick,
@@ -294,4 +389,8 @@ EXERCISES: dict[str, Callable[[Array], Array]] = {
     "wave": _wave,
     "overhead": _overhead,
     "punch": _punch,
+    "march": _march,
+    "lunge": _lunge,
+    "bow": _bow,
 }
+NOVEL = ("march", "lunge", "bow")  # nobody does these among the exercises

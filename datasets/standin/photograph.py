@@ -23,6 +23,7 @@ class Photograph:
     image: NDArray[np.uint8]  # [H, W, 3] sRGB, the person in front of the background
     mask: NDArray[np.bool_]  # [H, W] at least half the pixel shows the person
     parts: NDArray[np.uint8]  # [H, W] `outfit.Part` inside the mask, 0 outside
+    depth: NDArray[np.float32]  # [H, W] m, of the nearest sample of the person in the pixel; inf without any
 
 
 def photograph(
@@ -41,14 +42,17 @@ def photograph(
     image = background.copy()
     mask = np.zeros(image.shape[:2], bool)
     parts = np.zeros(image.shape[:2], np.uint8)
+    depth = np.full(image.shape[:2], np.inf, np.float32)
     points = camera.project(vertices)
     x0, y0 = np.maximum(np.floor(points[:, :2].min(0)).astype(int), 0)
     x1, y1 = np.minimum(np.ceil(points[:, :2].max(0)).astype(int), (camera.width, camera.height))
     if x1 <= x0 or y1 <= y0:
-        return Photograph(image, mask, parts)
+        return Photograph(image, mask, parts, depth)
     window = np.s_[y0:y1, x0:x1]
     points[:, :2] = (points[:, :2] - (x0, y0)) * SUPERSAMPLING
     raster = rasterize(points, body.faces, (y1 - y0) * SUPERSAMPLING, (x1 - x0) * SUPERSAMPLING)
+    samples = raster.depth.reshape(y1 - y0, SUPERSAMPLING, x1 - x0, SUPERSAMPLING)
+    depth[window] = samples.min((1, 3))
     image[window], mask[window], parts[window] = _shade_kernel()(
         raster.face,
         raster.bary,
@@ -64,7 +68,7 @@ def photograph(
         background[window],
         SUPERSAMPLING,
     )
-    return Photograph(image, mask, parts)
+    return Photograph(image, mask, parts, depth)
 
 
 @cache

@@ -38,14 +38,14 @@ class Subject:
     number: int
     body: Body
 
-    def _rng(self, what: str) -> np.random.Generator:
+    def rng(self, what: str) -> np.random.Generator:
         """An own stream for every aspect, so that changing one does not reshuffle the others."""
         return np.random.default_rng([self.seed, self.number, *what.encode()])
 
     @cached_property
     def betas(self) -> NDArray[np.float64]:
         """[10] shape coefficients."""
-        return np.clip(self._rng("shape").normal(0, 0.9, 10), -1.8, 1.8)
+        return np.clip(self.rng("shape").normal(0, 0.9, 10), -1.8, 1.8)
 
     @cached_property
     def style(self) -> outfit.Style:
@@ -53,33 +53,39 @@ class Subject:
         cast = np.random.default_rng([self.seed, *b"cast"])
         order = {what: cast.permutation(6) for what in ("skins", "hairs", "tops", "bottoms", "shoes")}
         place = (self.number - 1) % 6
-        return outfit.choose_style(self._rng("style"), {what: int(order[what][place]) for what in order})
+        return outfit.choose_style(self.rng("style"), {what: int(order[what][place]) for what in order})
 
     @cached_property
     def performance(self) -> motion.Performance:
         """The movements, before they are put on this body."""
         cast = np.random.default_rng([self.seed, *b"routines"])
         routine = ROUTINES[int(cast.permutation(len(ROUTINES))[(self.number - 1) % len(ROUTINES)])]
-        return motion.perform(self._rng("motion"), routine, full_turn=self.number % 2 == 1)
+        return motion.perform(self.rng("motion"), routine, full_turn=self.number % 2 == 1)
+
+    @cached_property
+    def novel_performance(self) -> motion.Performance:
+        """What they do after the exercises: movements that nobody makes among those."""
+        return motion.perform(self.rng("novel"), motion.NOVEL, full_turn=True, n_frames=motion.NOVEL_FRAMES)
 
     @cached_property
     def body_poses(self) -> list[BodyPose]:
         """One pose per frame, world with z up and the floor at z = 0."""
-        return motion.body_poses(self.performance, self.betas, self.body)
+        shows = (self.performance, self.novel_performance)
+        return [pose for show in shows for pose in motion.body_poses(show, self.betas, self.body)]
 
     @cached_property
     def lighting(self) -> Lighting:
-        return studio_lighting(self._rng("light"))
+        return studio_lighting(self.rng("light"))
 
     @cached_property
     def cameras(self) -> list[Camera]:
         """The calibrated rig of this person's session."""
-        return camera_ring(self._rng("rig"))
+        return camera_ring(self.rng("rig"))
 
     @cached_property
     def studio_seed(self) -> int:
         """Which studio the session took place in."""
-        return int(self._rng("studio").integers(2**31))
+        return int(self.rng("studio").integers(2**31))
 
     @cached_property
     def offsets(self) -> NDArray[np.float64]:

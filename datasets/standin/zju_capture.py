@@ -11,20 +11,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench import atomic
-from ihbench.body import Body, load_body
+from ihbench.body import load_body
 from ihbench.datasets import zju_mocap
-from ihbench.datasets.standin.motion import N_FRAMES
+from ihbench.datasets.standin.cast import NAME_PREFIX, claim, member_number
+from ihbench.datasets.standin.motion import N_FRAMES, NOVEL_FRAMES
 from ihbench.datasets.standin.photograph import photograph
 from ihbench.datasets.standin.rig import N_CAMERAS
 from ihbench.datasets.standin.studio import empty_studio
 from ihbench.datasets.standin.subject import Subject
-from ihbench.datasets.standin_mark import STANDIN_FILE
 from ihbench.errors import BadInput
 from ihbench.progress import Progress
 
-VERSION = 1  # of the generator; a change that moves a pixel raises it
-NAME_PREFIX = "standin-"
+VERSION = 2  # of the generator; a change that moves a pixel raises it
+ALL_FRAMES = N_FRAMES + NOVEL_FRAMES
 WAITING_THREADS = 2  # beyond one a core: they wait for the disk while the others draw
 
 
@@ -32,7 +31,7 @@ class ZjuStandIn:
     """Makes captures of procedural people. A file depends on (VERSION, seed, subject, camera, frame) only."""
 
     version = VERSION
-    n_frames = N_FRAMES
+    n_frames = ALL_FRAMES
     n_cameras = N_CAMERAS
 
     @staticmethod
@@ -57,11 +56,11 @@ class ZjuStandIn:
         root = Path(root).expanduser()
         if seed < 0:
             raise BadInput(f"stand-in seed {seed}: expected 0 or more")
-        numbers = [_number(subject) for subject in subjects]
+        numbers = [member_number(subject) for subject in subjects]
         frames_of = {camera: sorted(set(frames)) for camera, frames in sorted(wanted.items())}
         _check_wanted(frames_of)
         body = load_body()
-        _claim(root, seed, body)
+        claim(root, VERSION, seed, body)
         progress = progress or Progress.silent()
         for name, number in zip(subjects, numbers, strict=True):
             _ensure_subject(
@@ -74,55 +73,19 @@ class ZjuStandIn:
         return root
 
 
-def _number(subject: str) -> int:
-    number = subject.removeprefix(NAME_PREFIX)
-    if not subject.startswith(NAME_PREFIX) or not number.isdecimal() or int(number) < 1 or number != str(int(number)):
-        raise BadInput(f"stand-in subject {subject!r}: expected {NAME_PREFIX}1, {NAME_PREFIX}2, …")
-    return int(number)
-
-
 def _check_wanted(frames_of: dict[int, list[int]]) -> None:
     for camera, frames in frames_of.items():
         if not 0 <= camera < N_CAMERAS:
             raise BadInput(f"stand-in camera {camera}: expected 0 to {N_CAMERAS - 1}")
-        outside = next((frame for frame in frames if not 0 <= frame < N_FRAMES), None)
+        outside = next((frame for frame in frames if not 0 <= frame < ALL_FRAMES), None)
         if outside is not None:
-            raise BadInput(f"stand-in frame {outside}: expected 0 to {N_FRAMES - 1}")
-
-
-def _claim(root: Path, seed: int, body: Body) -> None:
-    """Mark the folder as this cast's, unless it belongs to something else."""
-    mark = {
-        "generator": "ihbench",
-        "version": VERSION,
-        "seed": seed,
-        "body": body.name,
-        "body_sha": body.content_sha(),
-    }
-    path = root / STANDIN_FILE
-    if path.is_file():
-        found = atomic.read_json(path)
-        if found != mark:
-            raise BadInput(
-                f"{root}: holds another stand-in ({_differences(found, mark)}); choose another folder or remove it"
-            )
-        return
-    if root.exists() and (not root.is_dir() or any(root.iterdir())):
-        raise BadInput(f"{root}: not an empty folder and not a stand-in; choose another folder")
-    atomic.write_json(path, mark)
-
-
-def _differences(found: object, asked: dict[str, object]) -> str:
-    if not isinstance(found, dict):
-        return "no readable mark"
-    differing = [key for key in asked if found.get(key) != asked[key]]
-    return ", ".join(f"{key} {found.get(key)!r}, asked for {asked[key]!r}" for key in differing) or "other keys"
+            raise BadInput(f"stand-in frame {outside}: expected 0 to {ALL_FRAMES - 1}")
 
 
 def _ensure_subject(
     folder: Path, name: str, subject: Subject, frames_of: dict[int, list[int]], progress: Progress
 ) -> None:
-    paths = zju_mocap.standard_image_paths(N_CAMERAS, N_FRAMES)
+    paths = zju_mocap.standard_image_paths(N_CAMERAS, ALL_FRAMES)
     wanted_frames = sorted({frame for frames in frames_of.values() for frame in frames})
     pictures = [
         (camera, frame)
@@ -131,7 +94,7 @@ def _ensure_subject(
         if not _all_there(folder, paths[frame][camera])
     ]
     vertices = [frame for frame in wanted_frames if not (folder / "new_vertices" / f"{frame}.npy").is_file()]
-    params = [frame for frame in range(N_FRAMES) if not (folder / "new_params" / f"{frame}.npy").is_file()]
+    params = [frame for frame in range(ALL_FRAMES) if not (folder / "new_params" / f"{frame}.npy").is_file()]
 
     @lru_cache(maxsize=128)
     def clothed(frame: int) -> NDArray[np.float64]:

@@ -43,7 +43,8 @@ def from_weak_perspective(
     cx + size/2 · s (X + tx) of the full image. The pinhole camera maps it to width/2 + focal (X + Tx) / (Z + Tz).
     Equal at Z = 0 for every X when focal / Tz = s · size / 2 and focal Tx / Tz = cx - width/2 + s · size / 2 · tx:
 
-        Tz = 2 focal / (s · size),   Tx = tx + 2 (cx - width/2) / (s · size),   Ty = ty + 2 (cy - height/2) / (s · size)
+        Tz = 2 focal / (s · size)
+        Tx = tx + 2 (cx - width/2) / (s · size),   Ty likewise with cy and height
 
     For other Z, distances from the image's centre differ by the factor 1 + Z / Tz, as perspective has it. A wrong
     `focal` moves the body nearer or farther and hardly moves its pixels. Raises `BadInput`.
@@ -176,8 +177,8 @@ def six_d_to_matrix(
     """[..., 3, 3] from the 6-number rotations of Zhou et al., which nobody orders alike. `layout` says how:
 
     "columns": the first column, then the second (4D-Humans);
-    "interleaved": R00 R01 R10 R11 R20 R21, the first two columns read row by row (SPIN, VIBE, PARE, ROMP);
-    "rows": the first row, then the second (PyTorch3D, and so GVHMR).
+    "interleaved": R00 R01 R10 R11 R20 R21, the first two columns read row by row (SPIN and its descendants);
+    "rows": the first row, then the second (PyTorch3D).
 
     Raises `BadInput`, also for numbers that span no plane.
     """

@@ -480,7 +480,7 @@ def test_check_counts_what_is_there_and_what_is_missing(copy):
     (copy / "mask/Camera_B2/000000.png").unlink()
     shutil.rmtree(copy / "mask_cihp")
     (copy / "new_vertices/2.npy").unlink()
-    found = zju_mocap.check(copy.parent)
+    found = ZjuMocap.check(copy.parent)
     (subject,) = found["subjects"]
     assert (found["dataset"], found["layout"], found["standin"], found["ok"]) == ("zju_mocap", "original", "", False)
     assert (subject["subject"], subject["variant"]) == ("377", "original/new_params")
@@ -493,14 +493,14 @@ def test_check_counts_what_is_there_and_what_is_missing(copy):
 
 def test_check_reports_a_damaged_subject_instead_of_raising(copy):
     (copy / "annots.npy").write_bytes(b"")
-    (subject,) = zju_mocap.check(copy.parent)["subjects"]
+    (subject,) = ZjuMocap.check(copy.parent)["subjects"]
     assert len(subject["problems"]) == 1
     assert "annots.npy" in subject["problems"][0]
 
 
 def test_check_notices_vertices_outside_the_silhouettes(written):
     """The tiny capture's bodies stand anywhere: nothing ties them to its masks."""
-    (subject,) = zju_mocap.check(written[0])["subjects"]
+    (subject,) = ZjuMocap.check(written[0])["subjects"]
     assert subject["vertices_in_mask"] < 0.95
     assert any("project into the silhouettes" in problem for problem in subject["problems"])
 

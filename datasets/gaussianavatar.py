@@ -1,0 +1,351 @@
+"""GaussianAvatar's copy of PeopleSnapshot: read, check and write folders of two splits.
+
+    <subject>/train/images/*.png|jpg     undistorted pictures; test/ holds the same files
+    <subject>/train/masks/*.png          128 and more = person
+    <subject>/train/cam_parms.npz        intrinsic [3, 3] (OpenCV), extrinsic [4, 4] world to camera, m
+    <subject>/train/cam_parms/*.npz      the same, a file for each image
+    <subject>/train/smpl_parms.pth       beta [1, 10], body_pose [N, 72] rad, root first, trans [N, 3] m
+
+Source: aipixel/GaussianAvatar scene/dataset_mono.py and scripts/sample_romp2gsavatar.py. The rows of smpl_parms.pth
+follow the images' names in sorted order.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench import atomic
+from ihbench.body import Body
+from ihbench.camera import Camera
+from ihbench.datasets.people_snapshot import (
+    SnapshotFolder,
+    checked,
+    chosen_folder,
+    finite_pose,
+    holds_raw,
+    read_npz,
+    rigid_extrinsic,
+    sample_frames,
+    spelled_rows,
+    spoiled_rows,
+    stacked,
+    subject_folders,
+)
+from ihbench.datasets.pictures import decoded, encoded, one_line, opened
+from ihbench.errors import BadInput
+from ihbench.scene import BodyPose
+
+SPLITS = ("train", "test")
+IMAGES, MASKS, CAMERA, POSES = "images", "masks", "cam_parms", "smpl_parms.pth"
+PICTURES = (".png", ".jpg", ".jpeg")
+PERSON_FROM = 128
+LARGEST_FRAME = 1_000_000  # stems above are no frame numbers (dates, …)
+
+
+class GaussianAvatar:
+    """A folder that holds subjects' folders of GaussianAvatar's layout, or one of those folders itself."""
+
+    layout = "gaussianavatar"
+
+    def __init__(self, root: Path):
+        """Raises `BadInput` when there is no such folder, or nothing of this layout in it."""
+        self.root = Path(root).expanduser()
+        wanted = f"GaussianAvatar's layout (train/ and test/ with {IMAGES}/, {MASKS}/, {CAMERA}.npz, {POSES})"
+        self._folders = subject_folders(self.root, holds_gaussianavatar, wanted)
+
+    @staticmethod
+    def check(root: Path, body: Body | None = None) -> dict[str, Any]:
+        """What this copy is and what it lacks; see `check` below."""
+        return check(root, body=body)
+
+    def subjects(self) -> list[str]:
+        """Names of the folders, sorted."""
+        return sorted(self._folders)
+
+    def open(self, subject: str, body: Body | None = None) -> GaussianAvatarCapture:
+        """One subject. Lists its images only. Raises `BadInput` for an unknown subject or one without images."""
+        return GaussianAvatarCapture(chosen_folder(self.root, self._folders, subject), body)
+
+
+@dataclass(frozen=True)
+class Stored:
+    """Where one frame lies."""
+
+    split: str
+    row: int  # of the split's smpl_parms.pth
+    image: Path
+
+
+class GaussianAvatarCapture(SnapshotFolder):
+    """One subject, read lazily; see `ihbench.scene.Capture`. Keeps no images.
+
+    Frames are numbered as the images are named when all names are numbers and none occurs twice, else consecutively:
+    those of train, then those of test. `frames` lists the numbers that exist, `split_of` says where they lie.
+    """
+
+    variant = "gaussianavatar"
+
+    def __init__(self, folder: Path, body: Body | None = None):
+        super().__init__(folder, folder.name, body)
+        stored = [
+            Stored(split, row, image)
+            for split in SPLITS
+            for row, image in enumerate(_pictures(folder / split / IMAGES))
+        ]
+        if not stored:
+            raise BadInput(f"{folder}: no image in train/{IMAGES} or test/{IMAGES}; expected .png or .jpg files")
+        stems = [entry.image.stem for entry in stored]
+        numbers = [int(stem) for stem in stems if stem.isascii() and stem.isdecimal() and len(stem) < 20]
+        self.numbered = len(set(numbers)) == len(stored) and max(numbers) <= LARGEST_FRAME
+        self._stored = dict(zip(numbers if self.numbered else range(len(stored)), stored, strict=True))
+        self.n_frames = max(self._stored) + 1
+        self._rows: dict[str, tuple[NDArray, NDArray, NDArray]] = {}
+
+    @property
+    def frames(self) -> list[int]:
+        """The numbers of the frames that exist, ascending."""
+        return sorted(self._stored)
+
+    def split_of(self, frame: int) -> str:
+        """ "train" or "test". Raises `BadInput` for a frame without an image."""
+        return self._where(frame).split
+
+    def camera(self, camera: int) -> Camera:
+        """The one camera, without distortion; its size comes from the header of the first image.
+
+        Raises `BadInput` when the images' own cameras differ: a moving camera is no fixed one.
+        """
+        self.check_index(camera, 0)
+        return self._camera
+
+    @cached_property
+    def _camera(self) -> Camera:
+        first: tuple[Path, NDArray, NDArray] | None = None
+        for path in dict.fromkeys(self.camera_path(frame) for frame in self.frames):
+            stored = read_npz(path, {"intrinsic": (3, 3), "extrinsic": None})
+            K, (R, t) = stored["intrinsic"].astype(np.float64), rigid_extrinsic(stored["extrinsic"], path)
+            E = np.column_stack([R, t])
+            if not np.isfinite(K).all():
+                raise BadInput(f"{path}: NaN or infinity in 'intrinsic'; expected finite numbers")
+            if first is None:
+                first = path, K, E
+            elif not (np.allclose(K, first[1], rtol=1e-6) and np.allclose(E, first[2], atol=1e-6)):
+                raise BadInput(f"{path}: another camera than {first[0]}; expected one fixed camera for all images")
+        assert first is not None
+        with opened(self._stored[self.frames[0]].image) as picture:
+            width, height = picture.size
+        return Camera.from_opencv(first[1], first[2][:, :3], first[2][:, 3], width, height)
+
+    def body_pose(self, frame: int) -> BodyPose:
+        """The frame's SMPL parameters, standard root convention."""
+        entry = self._where(frame)
+        return finite_pose(self.folder / entry.split / POSES, entry.row, *self._poses(entry.split))
+
+    def image(self, camera: int, frame: int) -> NDArray[np.uint8]:
+        """[H, W, 3] RGB, as stored."""
+        self.check_index(camera, frame)
+        path = self._where(frame).image
+        image = decoded(path, "RGB")
+        self.check_size(path, image, self._camera)
+        return image
+
+    def silhouette(self, camera: int, frame: int, source: str = "mask") -> NDArray[np.bool_]:
+        """[H, W]. `source` is "mask"."""
+        self.check_index(camera, frame)
+        self.check_source(source)
+        path = self.mask_path(frame)
+        if not path.is_file():
+            raise BadInput(f"{path}: no such file; expected the mask of frame {frame}{self.standin_hint}")
+        mask = decoded(path, None)
+        mask = mask if mask.ndim == 2 else mask.max(2)
+        self.check_size(path, mask, self._camera)
+        return mask if mask.dtype == bool else mask >= PERSON_FROM
+
+    def content_digest(self, camera: int, frame: int, source: str = "mask") -> bytes:
+        """Hash of the bytes of the frame's image and mask files; a missing file counts as empty."""
+        self.check_index(camera, frame)
+        digest = hashlib.sha256()
+        if frame in self._stored:
+            for path in (self._stored[frame].image, self.mask_path(frame)):
+                data = path.read_bytes() if path.is_file() else b""
+                digest.update(len(data).to_bytes(8, "little") + data)
+        return digest.digest()
+
+    def mask_path(self, frame: int) -> Path:
+        entry = self._where(frame)
+        return self.folder / entry.split / MASKS / f"{entry.image.stem}.png"
+
+    def camera_path(self, frame: int) -> Path:
+        """cam_parms.npz of the frame's split, else the image's own file in cam_parms/."""
+        entry = self._where(frame)
+        shared = self.folder / entry.split / f"{CAMERA}.npz"
+        own = self.folder / entry.split / CAMERA / f"{entry.image.stem}.npz"
+        return own if not shared.is_file() and own.parent.is_dir() else shared
+
+    def _where(self, frame: int) -> Stored:
+        self.check_index(0, frame)
+        if frame not in self._stored:
+            raise BadInput(
+                f"{self.folder}: no image of frame {frame} in train/{IMAGES} or test/{IMAGES}; "
+                f"ask for one of the {len(self._stored)} frames that are there{self.standin_hint}"
+            )
+        return self._stored[frame]
+
+    def _poses(self, split: str) -> tuple[NDArray, NDArray, NDArray]:
+        if split not in self._rows:
+            path = self.folder / split / POSES
+            rows = read_poses(path)
+            n_images = sum(entry.split == split for entry in self._stored.values())
+            if len(rows[0]) != n_images:
+                raise BadInput(
+                    f"{path}: {len(rows[0])} poses, but {split}/{IMAGES} holds {n_images} images; "
+                    f"expected a pose for each image"
+                )
+            self._rows[split] = rows
+        return self._rows[split]
+
+
+def holds_gaussianavatar(folder: Path) -> bool:
+    """Whether a folder is a subject of this layout, perhaps with one kind of file missing."""
+    return not holds_raw(folder) and any(_holds_split(folder / split) for split in SPLITS)
+
+
+def _holds_split(folder: Path) -> bool:
+    parts = (folder / POSES).is_file(), (folder / f"{CAMERA}.npz").is_file() or (folder / CAMERA).is_dir()
+    return sum((*parts, (folder / IMAGES).is_dir())) >= 2
+
+
+def _pictures(folder: Path) -> list[Path]:
+    """In sorted order of the names, which is the order of the poses."""
+    if not folder.is_dir():
+        return []
+    return sorted(
+        path for path in folder.iterdir() if path.suffix.lower() in PICTURES and not path.name.startswith(".")
+    )
+
+
+def read_poses(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """(body_pose [N, 72] rad, trans [N, 3] m, beta [10]) of smpl_parms.pth. Raises `BadInput`; runs nothing in it."""
+    import torch
+
+    if not path.is_file():
+        raise BadInput(f"{path}: no such file; expected beta, body_pose and trans of the split's images")
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # a broken or hostile file can fail in any way
+        raise BadInput(
+            f"{path}: not a file of plain tensors ({one_line(error)}); expected a complete file of torch.save"
+        ) from None
+    sizes = {"body_pose": 72, "trans": 3, "beta": 10}
+    if not isinstance(content, dict) or not sizes.keys() <= content.keys():
+        found = sorted(str(key) for key in content) if isinstance(content, dict) else type(content).__name__
+        raise BadInput(f"{path}: expected a dictionary with beta, body_pose and trans, found {found}")
+    values = []
+    for key, size in sizes.items():
+        value = content[key]
+        wanted = "[1, 10]" if key == "beta" else f"[N, {size}]"
+        real = isinstance(value, torch.Tensor) and not (value.is_complex() or value.is_sparse or value.is_quantized)
+        if not real or value.layout != torch.strided or value.device.type != "cpu":
+            raise BadInput(f"{path}: expected a tensor {wanted} in {key!r}, found a {type(value).__name__}")
+        value = value.detach().to(torch.float64).numpy()
+        value = value.reshape(-1) if key == "beta" else value
+        if value.shape[-1:] != (size,) or value.ndim != (1 if key == "beta" else 2):
+            raise BadInput(f"{path}: expected shape {wanted} in {key!r}, found {list(content[key].shape)}")
+        values.append(value)
+    pose, trans, beta = values
+    if len(pose) != len(trans):
+        raise BadInput(f"{path}: expected one 'trans' for each 'body_pose', found {len(trans)} and {len(pose)}")
+    return pose, trans, beta
+
+
+# ----------------------------------------------------------------------------------------------- check
+
+
+def check(root: Path, samples: int = 3, body: Body | None = None) -> dict[str, Any]:
+    """What this copy is and what it lacks, for `ihbench data check`; see `people_snapshot.check`."""
+    return checked(GaussianAvatar(root), body, lambda capture, found: _inspect(capture, samples, found))
+
+
+def _inspect(capture: GaussianAvatarCapture, samples: int, found: dict[str, Any]) -> None:
+    problems = found["problems"]
+    frames = capture.frames
+    masked = [frame for frame in frames if capture.mask_path(frame).is_file()]
+    found["files"] = {"image": len(frames), "mask": len(masked)}
+    found["missing"] = {"mask": len(frames) - len(masked)}
+    found["numbered"] = capture.numbered
+    if len(masked) < len(frames):
+        problems.append(f"{len(frames) - len(masked)} of mask missing")
+    for split in SPLITS:
+        found["files"][split] = sum(capture.split_of(frame) == split for frame in frames)
+        if not found["files"][split]:
+            problems.append(f"no image in {split}/{IMAGES}")
+            continue
+        try:
+            pose, trans, beta = capture._poses(split)
+            if not np.isfinite(beta).all():
+                problems.append(f"{capture.folder / split / POSES}: NaN or infinity in 'beta'")
+            elif rows := spoiled_rows(pose, trans):
+                problems.append(spelled_rows(capture.folder / split / POSES, rows))
+        except BadInput as error:
+            problems.append(str(error))
+    sample_frames(capture, masked, samples, found)
+
+
+# ----------------------------------------------------------------------------------------------- write
+
+
+def image_stem(frame: int) -> str:
+    return f"{frame:06d}"
+
+
+def write_camera(folder: Path, split: str, camera: Camera) -> None:
+    """The split's cam_parms.npz. Lossless, but for distortion, which this layout lacks: `ValueError`."""
+    if camera.distortion is not None and camera.distortion.any():
+        raise ValueError("GaussianAvatar camera: expected a camera without distortion, undistort the images first")
+    extrinsic = np.eye(4)
+    extrinsic[:3, :3], extrinsic[:3, 3] = camera.R, camera.t
+    buffer = io.BytesIO()
+    np.savez(buffer, intrinsic=camera.K_opencv, extrinsic=extrinsic)
+    atomic.write_bytes(_split(folder, split) / f"{CAMERA}.npz", buffer.getvalue(), durable=False)
+
+
+def write_frame(
+    folder: Path,
+    split: str,  # "train" or "test"
+    frame: int,
+    image: NDArray[np.uint8],  # [H, W, 3] RGB
+    mask: NDArray,  # [H, W] non-zero = person
+) -> None:
+    """The frame's image and mask as PNG. Lossless."""
+    label = np.where(mask != 0, 255, 0).astype(np.uint8)
+    for kind, picture in ((IMAGES, image), (MASKS, label)):
+        path = _split(folder, split) / kind / f"{image_stem(frame)}.png"
+        atomic.write_bytes(path, encoded(picture, "PNG", compress_level=3), durable=False)
+
+
+def write_poses(folder: Path, split: str, poses: Sequence[BodyPose]) -> None:
+    """The split's smpl_parms.pth, float32 (1e-6 rad and m): a pose for each of its frames, ascending.
+
+    Raises `ValueError` when the betas differ, which the file holds once.
+    """
+    import torch
+
+    pose, trans, betas = (torch.from_numpy(value) for value in stacked(poses))
+    buffer = io.BytesIO()
+    torch.save({"beta": betas[None].clone(), "body_pose": pose, "trans": trans}, buffer)
+    atomic.write_bytes(_split(folder, split) / POSES, buffer.getvalue(), durable=False)
+
+
+def _split(folder: Path, split: str) -> Path:
+    if split not in SPLITS:
+        raise ValueError(f"split: expected one of {SPLITS}, got {split!r}")
+    return folder / split

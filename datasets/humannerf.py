@@ -1,0 +1,344 @@
+"""The layout that HumanNeRF's and OccNeRF's preparation scripts write, read and written.
+
+    377/images/frame_000000.png                of one camera; images/camera_01_frame_000000.png of several, from 1
+    377/masks/…                                the same names, three channels, 0 or 255
+    377/cameras.pkl                            name -> intrinsics [3, 3], extrinsics [4, 4] m, distortions [5]
+    377/mesh_infos.pkl                         name -> Rh, Th, poses [72] with a zero root, (tpose_)joints [24, 3]
+    377/canonical_joints.pkl                   joints [24, 3], and avg_betas [10] in some copies
+
+Source: tiangexiang/OccNeRF tools/prepare_zju_mocap/prepare_dataset_eval.py:95-219. The root is ZJU-MoCap's (Rh, Th).
+Not every copy holds betas: then they follow from tpose_joints, which are linear in them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench import atomic
+from ihbench.body import Body, from_zju_root, zju_root
+from ihbench.camera import Camera
+from ihbench.datasets.capture_folder import CaptureFolder
+from ihbench.datasets.overlap import Overlap, overlap_of, overlap_problems
+from ihbench.datasets.pickles import write_pickle
+from ihbench.datasets.pictures import decoded, encoded, opened
+from ihbench.errors import BadInput
+from ihbench.registry import nearest
+from ihbench.safe_pickle import load_pickle
+from ihbench.scene import BodyPose
+
+NAME = re.compile(r"(?:camera_(\d+)_)?frame_(\d+)")
+FILES = ("cameras.pkl", "mesh_infos.pkl")
+MONOCULAR = "camera"  # the id of the only camera of a copy whose names hold none
+BETAS = 10  # found from joints where a copy holds none
+
+
+class HumanNerfFormat:
+    """A folder that holds subjects' folders, or one of those folders itself."""
+
+    def __init__(self, root: Path):
+        """Raises `BadInput` when there is nothing of this layout in it."""
+        self.root = Path(root).expanduser()
+        own = [self.root.absolute()] if _is_subject(self.root) else sorted(filter(_is_subject, _folders(self.root)))
+        self._folders = {folder.name: folder for folder in own}
+        if not own:
+            raise BadInput(
+                f"{self.root}: no HumanNeRF-style folder (images, masks, {', '.join(FILES)}) in it; "
+                f"expected what its preparation script writes"
+            )
+
+    @staticmethod
+    def check(root: Path, body: Body | None = None) -> dict[str, Any]:
+        return check(HumanNerfFormat(root), body)
+
+    def subjects(self) -> list[str]:
+        return sorted(self._folders)
+
+    def open(self, subject: str, body: Body | None = None) -> HumanNerfCapture:
+        """One subject. Reads the pickles only. Raises `BadInput` for an unknown subject or a damaged one."""
+        if subject not in self._folders:
+            raise BadInput(f"{self.root}: no subject {subject!r}: {nearest(subject, self.subjects())}")
+        return HumanNerfCapture(self._folders[subject], body)
+
+
+def _is_subject(folder: Path) -> bool:
+    return (folder / "images").is_dir() and all((folder / name).is_file() for name in FILES)
+
+
+def _folders(root: Path) -> list[Path]:
+    return [path for path in root.iterdir() if path.is_dir()] if root.is_dir() else []
+
+
+class HumanNerfCapture(CaptureFolder):
+    """One subject, read lazily; see `ihbench.scene.Capture`. Keeps no images.
+
+    A frame is the number in the names; a frame without a file is missing, and said so when it is read.
+    """
+
+    dataset, variant = "zju_mocap", "humannerf"
+
+    def __init__(self, folder: Path, body: Body | None = None):
+        super().__init__(folder, folder.name, body)
+        self._cameras = _dictionary(folder / "cameras.pkl")
+        self._infos = _dictionary(folder / "mesh_infos.pkl")
+        self._names: dict[tuple[str, int], str] = {}
+        for name in self._cameras:
+            match = NAME.fullmatch(str(name))
+            if match is None:
+                raise BadInput(
+                    f"{folder / 'cameras.pkl'}: name {name!r}; expected frame_000000 or camera_01_frame_000000"
+                )
+            key = match[1] or MONOCULAR, int(match[2])
+            if key in self._names:
+                raise BadInput(f"{folder / 'cameras.pkl'}: frame {key[1]} is there twice; remove one of them")
+            self._names[key] = str(name)
+        ids = sorted({camera for camera, _ in self._names} - {MONOCULAR}, key=int)
+        if any(camera == MONOCULAR for camera, _ in self._names):
+            ids.insert(0, MONOCULAR)
+        self.camera_ids = tuple(ids)
+        self.n_frames = max(frame for _, frame in self._names) + 1
+        self._sizes: dict[int, tuple[int, int]] = {}
+
+    def camera(self, camera: int) -> Camera:
+        """The camera of its first frame, with its lens distortion; all frames of one share it."""
+        self.check_index(camera, 0)
+        own = self.camera_ids[camera]
+        name = self._names[own, min(frame for other, frame in self._names if other == own)]
+        entry, path = self._cameras[name], self.folder / "cameras.pkl"
+        K = _numbers(entry, "intrinsics", (3, 3), path, name)
+        E = _numbers(entry, "extrinsics", (4, 4), path, name)
+        D = _numbers(entry, "distortions", (5,), path, name) if "distortions" in entry else None
+        if camera not in self._sizes:
+            with opened(self._picture("images", name)) as picture:
+                self._sizes[camera] = picture.size
+        return Camera.from_opencv(K, E[:3, :3], E[:3, 3], *self._sizes[camera], D)
+
+    def body_pose(self, frame: int) -> BodyPose:
+        self.check_index(0, frame)
+        name = next((n for (_, f), n in self._names.items() if f == frame and n in self._infos), None)
+        path = self.folder / "mesh_infos.pkl"
+        if name is None:
+            raise BadInput(f"{path}: no pose of frame {frame}; expected one for every frame of cameras.pkl")
+        info = self._infos[name]
+        poses, Rh, Th = (_numbers(info, k, (n,), path, name) for k, n in (("poses", 72), ("Rh", 3), ("Th", 3)))
+        try:
+            return from_zju_root(poses, self._betas(info, path, name), Rh, Th, self.model)
+        except BadInput as error:
+            raise BadInput(f"{path}: {name}: {error}") from error
+
+    def _betas(self, info: Mapping[str, Any], path: Path, name: str) -> NDArray[np.float64]:
+        if "betas" in info:
+            return _numbers(info, "betas", None, path, name)
+        if self._average_betas is not None:
+            return self._average_betas
+        joints = _numbers(info, "tpose_joints", (24, 3), path, name)
+        key = joints.tobytes()
+        if key not in self._found_betas:
+            self._found_betas[key] = betas_of_joints(joints, self.model)
+        return self._found_betas[key]
+
+    @cached_property
+    def _found_betas(self) -> dict[bytes, NDArray[np.float64]]:
+        return {}
+
+    @cached_property
+    def _average_betas(self) -> NDArray[np.float64] | None:
+        path = self.folder / "canonical_joints.pkl"
+        found = _dictionary(path) if path.is_file() else {}
+        return _numbers(found, "avg_betas", None, path, "") if "avg_betas" in found else None
+
+    def image(self, camera: int, frame: int) -> NDArray[np.uint8]:
+        """[H, W, 3] RGB, as stored."""
+        return self._read("images", camera, frame, "RGB")
+
+    def silhouette(self, camera: int, frame: int, source: str = "mask") -> NDArray[np.bool_]:
+        """[H, W]. The preparation has joined the original's masks: "mask" and "union" are the same here."""
+        if source not in ("mask", "union"):
+            raise BadInput(f"{self.folder}: silhouette source {source!r}: this layout has joined masks only")
+        return self._read("masks", camera, frame, "L") >= 128
+
+    def content_digest(self, camera: int, frame: int, source: str = "mask") -> bytes:
+        digest = hashlib.sha256()
+        name = self._names.get((self.camera_ids[camera], frame))
+        for kind in ("images", "masks"):
+            path = None if name is None else self._picture(kind, name)
+            digest.update(path.read_bytes() if path is not None and path.is_file() else b"")
+        return digest.digest()
+
+    def has(self, camera: int, frame: int) -> bool:
+        """Whether the copy lists this view."""
+        return (self.camera_ids[camera], frame) in self._names
+
+    def _read(self, kind: str, camera: int, frame: int, mode: str) -> NDArray[np.uint8]:
+        self.check_index(camera, frame)
+        name = self._names.get((self.camera_ids[camera], frame))
+        if name is None:
+            raise BadInput(f"{self.folder}: no frame {frame} of camera {self.camera_ids[camera]} in cameras.pkl")
+        path = self._picture(kind, name)
+        if not path.is_file():
+            raise BadInput(f"{path}: no such file; cameras.pkl lists it")
+        picture = decoded(path, mode)
+        size = self.camera(camera)
+        if picture.shape[:2] != (size.height, size.width):
+            raise BadInput(
+                f"{path}: {picture.shape[1]}×{picture.shape[0]} px, expected {size.width}×{size.height} px as the "
+                f"camera's first image"
+            )
+        return picture
+
+    def _picture(self, kind: str, name: str) -> Path:
+        png = self.folder / kind / f"{name}.png"
+        jpg = png.with_suffix(".jpg")
+        return jpg if kind == "images" and not png.is_file() and jpg.is_file() else png
+
+
+def betas_of_joints(joints: NDArray[np.float64], body: Body) -> NDArray[np.float64]:
+    """[10] shape coefficients whose rest-pose joints are `joints` [24, 3] m, in the sense of least squares."""
+    zero = body.shaped(np.zeros(BETAS))[1]
+    columns = [(body.shaped(np.eye(BETAS)[k])[1] - zero).ravel() for k in range(BETAS)]
+    return np.linalg.lstsq(np.stack(columns, 1), (joints - zero).ravel(), rcond=None)[0]
+
+
+def _dictionary(path: Path) -> dict[str, Any]:
+    found = load_pickle(path)
+    if not isinstance(found, dict) or not found:
+        raise BadInput(f"{path}: expected a dictionary with entries, found {type(found).__name__}")
+    return found
+
+
+def _numbers(entry: Any, key: str, shape: tuple[int, ...] | None, path: Path, name: str) -> NDArray[np.float64]:
+    wanted = f"{path}: {name}: expected {key!r}" + (f" of shape {list(shape)}" if shape else "")
+    if not isinstance(entry, Mapping) or key not in entry:
+        raise BadInput(f"{wanted}, found no such key")
+    try:
+        value = np.asarray(entry[key], np.float64)
+    except (TypeError, ValueError):
+        raise BadInput(f"{wanted}, found {type(entry[key]).__name__}") from None
+    value = value.reshape(-1) if shape is None or len(shape) == 1 else value
+    if shape is not None and value.shape != shape:
+        raise BadInput(f"{wanted}, found {list(value.shape)}")
+    if not np.isfinite(value).all():
+        raise BadInput(f"{wanted}, found NaN or infinity in it")
+    return value
+
+
+# ----------------------------------------------------------------------------------------------- check
+
+
+def check(dataset: HumanNerfFormat, body: Body | None = None, samples: int = 4) -> dict[str, Any]:
+    """What a copy is and lacks, for `ihbench data check`."""
+    subjects = []
+    for name in dataset.subjects():
+        problems: list[str] = []
+        found: dict[str, Any] = {"subject": name, "problems": problems}
+        try:
+            capture = dataset.open(name, _fitting(dataset, name, body))
+            views = sorted((c, f) for c in range(len(capture.camera_ids)) for f in range(capture.n_frames)
+                           if capture.has(c, f))  # fmt: skip
+            missing = {
+                kind: sum(not capture._picture(kind, capture._names[capture.camera_ids[c], f]).is_file()
+                          for c, f in views)
+                for kind in ("images", "masks")
+            }  # fmt: skip
+            found |= {
+                "standin": capture.standin, "body": capture.body, "variant": capture.variant,
+                "cameras": len(capture.camera_ids), "frames": capture.n_frames, "views": len(views),
+                "missing": missing,
+            }  # fmt: skip
+            problems += [f"{n} of {kind} missing" for kind, n in missing.items() if n]
+            _sample(capture, views, samples, found, problems)
+        except BadInput as error:
+            problems.append(str(error))
+        subjects.append(found)
+    return {
+        "dataset": "zju_mocap",
+        "layout": "humannerf",
+        "root": str(dataset.root),
+        "standin": next((s["standin"] for s in subjects if s.get("standin")), ""),
+        "subjects": subjects,
+        "ok": not any(s["problems"] for s in subjects),
+    }
+
+
+def _fitting(dataset: HumanNerfFormat, name: str, body: Body | None) -> Body | None:
+    """The body given, unless the copy is a stand-in, which has its own."""
+    return None if dataset.open(name).standin else body
+
+
+def _sample(
+    capture: HumanNerfCapture, views: list[tuple[int, int]], samples: int, found: dict, problems: list[str]
+) -> None:
+    overlaps: list[Overlap] = []
+    for k in sorted({int(k) for k in np.linspace(0, len(views) - 1, samples)}):
+        camera, frame = views[k]
+        try:
+            height, width, _ = capture.image(camera, frame).shape
+            found["image_size"] = [[width, height]]
+            mask = capture.silhouette(camera, frame)
+            if not capture.has_model:
+                continue  # poses need the SMPL file
+            points = capture.camera(camera).project(capture.model.pose(capture.body_pose(frame)))
+        except BadInput as error:
+            problems.append(str(error))
+            continue
+        overlaps.append(overlap_of(points, mask))
+    if overlaps:
+        found["vertices_in_mask"] = round(float(np.mean([o.inside for o in overlaps])), 4)
+        problems += overlap_problems(overlaps)
+
+
+# ----------------------------------------------------------------------------------------------- write
+
+
+def view_name(frame: int, camera: int | None = None) -> str:
+    """The name of a view; `camera` counts from 0 and is None where there is only one."""
+    return f"frame_{frame:06d}" if camera is None else f"camera_{camera + 1:02d}_frame_{frame:06d}"
+
+
+def write_pickles(
+    folder: Path,
+    views: Mapping[str, tuple[Camera, BodyPose]],  # name -> camera and pose of that view
+    body: Body,
+    with_betas: bool = True,
+) -> None:
+    """cameras.pkl, mesh_infos.pkl and canonical_joints.pkl; the reader undoes them to 1e-12."""
+    cameras, infos = {}, {}
+    for name, (camera, body_pose) in views.items():
+        E = np.eye(4)
+        E[:3, :3], E[:3, 3] = camera.R, camera.t
+        lens = np.zeros(5) if camera.distortion is None else camera.distortion.copy()
+        cameras[name] = {"intrinsics": camera.K_opencv, "extrinsics": E, "distortions": lens}
+        Rh, Th = zju_root(body_pose, body)
+        poses = body_pose.pose.copy()
+        poses[0] = 0
+        unturned = BodyPose(poses, body_pose.betas, np.zeros(3))
+        infos[name] = {
+            "Rh": Rh,
+            "Th": Th,
+            "poses": poses.reshape(72),
+            "joints": body.posed_joints(unturned),
+            "tpose_joints": body.shaped(body_pose.betas)[1],
+        }
+        if with_betas:
+            infos[name]["betas"] = body_pose.betas.copy()
+    mean = np.mean([pose.betas for _, pose in views.values()], 0)
+    canonical: dict[str, Any] = {"joints": body.shaped(mean)[1]}
+    if with_betas:
+        canonical["avg_betas"] = mean
+    write_pickle(folder / "cameras.pkl", cameras)
+    write_pickle(folder / "mesh_infos.pkl", infos)
+    write_pickle(folder / "canonical_joints.pkl", canonical)
+
+
+def write_view(folder: Path, name: str, image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> None:
+    """The PNG files of one view: image [H, W, 3] RGB, mask [H, W] in three channels of 0 or 255. Lossless."""
+    atomic.write_bytes(folder / "images" / f"{name}.png", encoded(image, "PNG", compress_level=3), durable=False)
+    three = np.repeat(mask.astype(np.uint8)[..., None] * 255, 3, axis=2)
+    atomic.write_bytes(folder / "masks" / f"{name}.png", encoded(three, "PNG", compress_level=3), durable=False)

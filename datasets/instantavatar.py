@@ -1,0 +1,364 @@
+"""InstantAvatar's copy of PeopleSnapshot, images undistorted: read, check and write one folder a subject.
+
+    images/image_0000.png              numbered from 0, as the video's frames
+    masks/mask_0000.npy                [H, W], 0 to 1 or 0 to 255; may be soft, more than half = person
+    cameras.npz                        intrinsic [3, 3] (OpenCV), extrinsic [4, 4] world to camera m, height, width
+    poses.npz                          betas [10], thetas [N, 72] rad, root first, transl [N, 3] m
+    poses/anim_nerf_train.npz          Anim-NeRF's poses of the training frames, and …_test.npz of the test frames
+
+Source: tijiang13/InstantAvatar scripts/peoplesnapshot/ and instant_avatar/datasets/peoplesnapshot.py. Anim-NeRF's
+files replace the poses of their frames. They do not say which frames these are; for the four subjects that
+InstantAvatar uses the subject's name tells. Files written here say it, in `frames`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench import atomic
+from ihbench.body import Body
+from ihbench.camera import Camera
+from ihbench.datasets.gaussianavatar import holds_gaussianavatar
+from ihbench.datasets.people_snapshot import (
+    SnapshotFolder,
+    checked,
+    chosen_folder,
+    finite_pose,
+    holds_raw,
+    read_npz,
+    rigid_extrinsic,
+    sample_frames,
+    spelled_rows,
+    spoiled_rows,
+    stacked,
+    subject_folders,
+)
+from ihbench.datasets.pictures import decoded, encoded
+from ihbench.errors import BadInput
+from ihbench.safe_pickle import load_npy
+from ihbench.scene import BodyPose
+
+CAMERA_FILE, POSES_FILE = "cameras.npz", "poses.npz"
+REFINED = {"train": "poses/anim_nerf_train.npz", "test": "poses/anim_nerf_test.npz"}
+IMAGE_NAME = re.compile(r"image_(\d{4,9})\.png")
+# confs/dataset/peoplesnapshot/*.yaml; their ends are inclusive
+OFFICIAL_FRAMES = {
+    "female-3-casual": {"train": range(0, 446, 4), "test": range(446, 648, 4)},
+    "female-4-casual": {"train": range(0, 336, 4), "test": range(335, 524, 4)},
+    "male-3-casual": {"train": range(0, 456, 4), "test": range(456, 676, 4)},
+    "male-4-casual": {"train": range(0, 660, 6), "test": range(660, 873, 6)},
+}
+
+
+class InstantAvatar:
+    """A folder that holds subjects' folders of InstantAvatar's layout, or one of those folders itself."""
+
+    layout = "instantavatar"
+
+    def __init__(self, root: Path):
+        """Raises `BadInput` when there is no such folder, or nothing of this layout in it."""
+        self.root = Path(root).expanduser()
+        wanted = f"InstantAvatar's layout (images/image_0000.png, masks/, {CAMERA_FILE}, {POSES_FILE})"
+        self._folders = subject_folders(self.root, holds_instantavatar, wanted)
+
+    @staticmethod
+    def check(root: Path, body: Body | None = None) -> dict[str, Any]:
+        """What this copy is and what it lacks; see `check` below."""
+        return check(root, body=body)
+
+    def subjects(self) -> list[str]:
+        """Names of the folders, sorted."""
+        return sorted(self._folders)
+
+    def open(self, subject: str, body: Body | None = None) -> InstantAvatarCapture:
+        """One subject. Reads cameras and poses, and lists the images. Raises `BadInput` for an unknown subject or a
+        damaged one."""
+        return InstantAvatarCapture(chosen_folder(self.root, self._folders, subject), body)
+
+
+class InstantAvatarCapture(SnapshotFolder):
+    """One subject, read lazily; see `ihbench.scene.Capture`. Keeps no images.
+
+    There are as many frames as poses; images that real data lack at the end shorten it.
+    """
+
+    def __init__(self, folder: Path, body: Body | None = None):
+        super().__init__(folder, folder.name, body)
+        self._camera = read_camera(folder / CAMERA_FILE)
+        self._poses = read_poses(folder / POSES_FILE)
+        self.images = _numbered_images(folder / "images")
+        n_poses = len(self._poses[0])
+        if not self.images:
+            raise BadInput(f"{folder / 'images'}: no image_NNNN.png in it; expected the subject's frames")
+        # a stand-in holds only the images it was asked for
+        self.n_frames = n_poses if self.standin else min(n_poses, self.images[-1] + 1)
+        self.refined = {
+            split: read_refined(folder / name, split, self.name, n_poses)
+            for split, name in REFINED.items()
+            if (folder / name).is_file()
+        }
+        self._row_of: dict[int, tuple[str, int]] = {}
+        for split, (frames, *_) in self.refined.items():
+            for row, frame in enumerate(frames):
+                if frame in self._row_of:
+                    other = self._row_of[frame][0]
+                    raise BadInput(
+                        f"{folder / REFINED[split]}: frame {frame} has refined poses in {REFINED[other]}, too; "
+                        f"expected each frame once, remove one of the files"
+                    )
+                self._row_of[frame] = split, row
+        self.variant = "instantavatar/anim_nerf" if self.refined else "instantavatar"
+
+    def camera(self, camera: int) -> Camera:
+        """The one camera; without distortion, since the images are undistorted."""
+        self.check_index(camera, 0)
+        return self._camera
+
+    def body_pose(self, frame: int) -> BodyPose:
+        """The frame's SMPL parameters, standard root convention: Anim-NeRF's where there are any."""
+        self.check_index(0, frame)
+        if frame not in self._row_of:
+            return finite_pose(self.folder / POSES_FILE, frame, *self._poses)
+        split, row = self._row_of[frame]
+        return finite_pose(self.folder / REFINED[split], row, *self.refined[split][1:])
+
+    def image(self, camera: int, frame: int) -> NDArray[np.uint8]:
+        """[H, W, 3] RGB, as stored."""
+        self.check_index(camera, frame)
+        path = self.image_path(frame)
+        if not path.is_file():
+            raise BadInput(f"{path}: no such file; expected the image of frame {frame}{self.standin_hint}")
+        image = decoded(path, "RGB")
+        self.check_size(path, image, self._camera)
+        return image
+
+    def silhouette(self, camera: int, frame: int, source: str = "mask") -> NDArray[np.bool_]:
+        """[H, W], True where the stored mask is above one half. `source` is "mask"."""
+        self.check_index(camera, frame)
+        self.check_source(source)
+        path = self.mask_path(frame)
+        if not path.is_file():
+            raise BadInput(f"{path}: no such file; expected the mask of frame {frame}{self.standin_hint}")
+        mask = read_mask(path)
+        self.check_size(path, mask, self._camera)
+        return mask
+
+    def content_digest(self, camera: int, frame: int, source: str = "mask") -> bytes:
+        """Hash of the bytes of the frame's image and mask files; a missing file counts as empty."""
+        self.check_index(camera, frame)
+        digest = hashlib.sha256()
+        for path in (self.image_path(frame), self.mask_path(frame)):
+            data = path.read_bytes() if path.is_file() else b""
+            digest.update(len(data).to_bytes(8, "little") + data)
+        return digest.digest()
+
+    def image_path(self, frame: int) -> Path:
+        return self.folder / "images" / f"image_{frame:04d}.png"
+
+    def mask_path(self, frame: int) -> Path:
+        return self.folder / "masks" / f"mask_{frame:04d}.npy"
+
+
+def holds_instantavatar(folder: Path) -> bool:
+    """Whether a folder is a subject of this layout, perhaps with one of its files missing.
+
+    GaussianAvatar's copies are made beside cameras.npz and images/ of their source; those count as GaussianAvatar's.
+    """
+    parts = (folder / CAMERA_FILE).is_file(), (folder / POSES_FILE).is_file()
+    if not any(parts) or holds_raw(folder) or holds_gaussianavatar(folder):
+        return False
+    return all(parts) or any((folder / "images").glob("image_*.png"))
+
+
+def _numbered_images(folder: Path) -> list[int]:
+    if not folder.is_dir():
+        return []
+    found = (IMAGE_NAME.fullmatch(path.name) for path in folder.iterdir())
+    return sorted(int(match[1]) for match in found if match)
+
+
+def read_camera(path: Path) -> Camera:
+    """The camera of cameras.npz. Raises `BadInput` naming the entry that is not as expected."""
+    stored = read_npz(path, {"intrinsic": (3, 3), "extrinsic": None, "height": None, "width": None})
+    K = stored["intrinsic"].astype(np.float64)
+    if not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
+        raise BadInput(f"{path}: expected finite numbers and positive focal lengths in 'intrinsic', found others")
+    sizes = []
+    for key in ("width", "height"):
+        value = stored[key].reshape(-1)
+        if value.size != 1 or not float(value[0]).is_integer() or not 1 <= value[0] <= 65535:
+            raise BadInput(f"{path}: expected one whole number of pixels in {key!r}, found {value.tolist()}")
+        sizes.append(int(value[0]))
+    return Camera.from_opencv(K, *rigid_extrinsic(stored["extrinsic"], path), *sizes)
+
+
+def read_poses(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """(thetas [N, 72] rad, transl [N, 3] m, betas [10]); poses may hold NaN. Raises `BadInput` for other shapes.
+
+    Accepts `global_orient` [N, 3] and `body_pose` [N, 69] in place of thetas, as InstantAvatar does.
+    """
+    shapes: dict[str, tuple[int | None, ...] | None] = {
+        "betas": None,
+        "transl": (None, 3),
+        "thetas?": (None, 72),
+        "global_orient?": (None, 3),
+        "body_pose?": (None, 69),
+    }
+    stored = read_npz(path, shapes)
+    if "thetas" in stored:
+        thetas = stored["thetas"]
+    elif {"global_orient", "body_pose"} <= stored.keys():
+        if len(stored["global_orient"]) != len(stored["body_pose"]):
+            raise BadInput(f"{path}: expected as many global_orient as body_pose, found others")
+        thetas = np.concatenate([stored["global_orient"], stored["body_pose"]], 1)
+    else:
+        raise BadInput(f"{path}: expected 'thetas' in it, found {', '.join(sorted(stored))}")
+    betas, transl = stored["betas"].reshape(-1), stored["transl"]
+    if betas.size != 10 or not np.isfinite(betas).all():
+        raise BadInput(f"{path}: expected 10 finite numbers in 'betas', found {list(stored['betas'].shape)} or NaN")
+    if len(thetas) != len(transl) or not len(thetas):
+        raise BadInput(f"{path}: expected one 'transl' for each pose, found {len(transl)} and {len(thetas)}")
+    return thetas.astype(np.float64), transl.astype(np.float64), betas.astype(np.float64)
+
+
+def read_refined(
+    path: Path, split: str, subject: str, n_frames: int
+) -> tuple[list[int], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """(frames, thetas [n, 72], transl [n, 3], betas [10]) of one of Anim-NeRF's files.
+
+    Raises `BadInput` when the file does not say its frames and the subject's official split has another count.
+    """
+    poses = read_poses(path)
+    count = len(poses[0])
+    stored = read_npz(path, {"frames?": (None,)}).get("frames")
+    if stored is not None:
+        frames = [int(frame) for frame in stored]
+        if stored.dtype.kind not in "iu" or len(frames) != count or len(set(frames)) != count:
+            raise BadInput(f"{path}: expected {count} different frame numbers in 'frames', found others")
+    else:
+        official = OFFICIAL_FRAMES.get(subject, {}).get(split)
+        if official is None or len(official) != count:
+            known = f"its {split} split has {len(official)}" if official else "it has no official split"
+            raise BadInput(
+                f"{path}: {count} poses, but no 'frames' says whose, and of {subject!r} is known that {known}; "
+                f"add the frame numbers as 'frames', or remove the file"
+            )
+        frames = list(official)
+    if min(frames) < 0 or max(frames) >= n_frames:
+        raise BadInput(
+            f"{path}: refines frames {min(frames)} to {max(frames)}, but {POSES_FILE} has {n_frames} poses; "
+            f"expected frames of this subject"
+        )
+    return frames, *poses
+
+
+def read_mask(path: Path) -> NDArray[np.bool_]:
+    """[H, W], True where a mask of 0 to 1 or of 0 to 255 is above one half. Raises `BadInput`."""
+    mask = load_npy(path)
+    if mask.ndim == 3 and mask.shape[2] == 1:
+        mask = mask[..., 0]
+    if mask.ndim != 2 or mask.dtype.kind not in "biuf":
+        raise BadInput(f"{path}: expected numbers of shape [H, W], found {mask.dtype} of shape {list(mask.shape)}")
+    if mask.dtype == bool:
+        return mask
+    lowest, highest = (float(mask.min()), float(mask.max())) if mask.size else (0.0, 0.0)
+    if not (np.isfinite([lowest, highest]).all() and lowest >= -0.01 and highest <= 255):
+        raise BadInput(f"{path}: expected 0 to 1, or 0 to 255, found {lowest:g} to {highest:g}")
+    # a soft mask of 0 to 1 may overshoot a little where it was resampled
+    return mask > (0.5 if highest <= 1.5 else 127.5)
+
+
+# ----------------------------------------------------------------------------------------------- check
+
+
+def check(root: Path, samples: int = 3, body: Body | None = None) -> dict[str, Any]:
+    """What this copy is and what it lacks, for `ihbench data check`; see `people_snapshot.check`."""
+    return checked(InstantAvatar(root), body, lambda capture, found: _inspect(capture, samples, found))
+
+
+def _inspect(capture: InstantAvatarCapture, samples: int, found: dict[str, Any]) -> None:
+    problems = found["problems"]
+    images = [frame for frame in capture.images if frame < capture.n_frames]
+    masked = [frame for frame in images if capture.mask_path(frame).is_file()]
+    n_masks = sum(capture.mask_path(frame).is_file() for frame in range(capture.n_frames))
+    found["files"] = {"image": len(images), "mask": n_masks, "poses": len(capture._poses[0])}
+    found["files"] |= {f"anim_nerf_{split}": len(refined[0]) for split, refined in capture.refined.items()}
+    found["missing"] = {"image": capture.n_frames - len(images), "mask": capture.n_frames - n_masks}
+    if not capture.standin:
+        problems += [f"{n} of {what} missing" for what, n in found["missing"].items() if n]
+    if surplus := sum(frame >= len(capture._poses[0]) for frame in capture.images):
+        problems.append(f"{surplus} images have no pose in {POSES_FILE}")
+    for name, poses in (
+        (POSES_FILE, capture._poses[:2]),
+        *((REFINED[s], r[1:3]) for s, r in capture.refined.items()),
+    ):
+        if rows := spoiled_rows(*poses):
+            problems.append(spelled_rows(capture.folder / name, rows))
+    if masked:
+        sample_frames(capture, masked, samples, found)
+    else:
+        problems.append("no image with its mask found")
+
+
+# ----------------------------------------------------------------------------------------------- write
+
+
+def write_camera(folder: Path, camera: Camera) -> None:
+    """cameras.npz. Lossless, but for distortion, which this layout lacks: `ValueError`."""
+    if camera.distortion is not None and camera.distortion.any():
+        raise ValueError("InstantAvatar camera: expected a camera without distortion, undistort the images first")
+    extrinsic = np.eye(4)
+    extrinsic[:3, :3], extrinsic[:3, 3] = camera.R, camera.t
+    _write_npz(
+        folder / CAMERA_FILE,
+        intrinsic=camera.K_opencv,
+        extrinsic=extrinsic,
+        height=np.array(camera.height),
+        width=np.array(camera.width),
+    )
+
+
+def write_poses(folder: Path, poses: Sequence[BodyPose]) -> None:
+    """poses.npz, float32 (1e-6 rad and m): a pose for each frame from 0. `ValueError` when the betas differ."""
+    thetas, transl, betas = stacked(poses)
+    _write_npz(folder / POSES_FILE, betas=betas, thetas=thetas, transl=transl)
+
+
+def write_refined(folder: Path, split: str, frames: Sequence[int], poses: Sequence[BodyPose]) -> None:
+    """poses/anim_nerf_<split>.npz with the frames it refines, float32. `split` is "train" or "test"."""
+    if len(frames) != len(poses):
+        raise ValueError(f"refined poses: expected one for each of {len(frames)} frames, got {len(poses)}")
+    thetas, transl, betas = stacked(poses)
+    _write_npz(
+        folder / REFINED[split], betas=betas, thetas=thetas, transl=transl, frames=np.asarray(frames, np.int64)
+    )
+
+
+def write_frame(
+    folder: Path,
+    frame: int,
+    image: NDArray[np.uint8] | None = None,  # [H, W, 3] RGB
+    mask: NDArray | None = None,  # [H, W] non-zero = person
+) -> None:
+    """The frame's image as PNG and its mask as uint8 0/1. Lossless. None is not written."""
+    if image is not None:
+        path = folder / "images" / f"image_{frame:04d}.png"
+        atomic.write_bytes(path, encoded(image, "PNG", compress_level=3), durable=False)
+    if mask is not None:
+        buffer = io.BytesIO()
+        np.save(buffer, (mask != 0).astype(np.uint8))
+        atomic.write_bytes(folder / "masks" / f"mask_{frame:04d}.npy", buffer.getvalue(), durable=False)
+
+
+def _write_npz(path: Path, **arrays: Any) -> None:
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    atomic.write_bytes(path, buffer.getvalue(), durable=False)

@@ -1,0 +1,646 @@
+"""OcMotion as its authors released it: read, check and write the folder with `annot/`.
+
+    annot/train.pkl, annot/test.pkl     [sequence][camera][frame] = {img_path, h_w, "0": person, "1": person, …}
+    images/0011/02/00001.jpg            whatever img_path says, relative to the folder that holds annot/
+    masks/0011/02/00001.png             not part of the release: the visible person, made by the user
+
+A person is {bbox [2, 2], lsp_joints_2d [n, 2+], pose 72, betas 10, trans 3, intri [3, 3], extri [4, 4]}. The camera
+is OpenCV's (integer pixel centres, world to camera, metres) without distortion; vertices are
+SMPL(betas, pose) + trans in the world, standard root. Masks lie at masks/ + img_path without a leading images/ and
+with the suffix .png, non-zero (channel 0 of several) where the person is visible; for further people of an image the
+name ends in _p1, _p2, ….
+
+Source: boycehbz/CHOMP vis_OcMotion.py. What the `_w2a` sequences share with this layout is here, too.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench import atomic
+from ihbench.body import Body
+from ihbench.camera import Camera
+from ihbench.datasets.capture_folder import CaptureFolder
+from ihbench.datasets.overlap import share_inside
+from ihbench.datasets.pickles import write_pickle
+from ihbench.datasets.pictures import decoded, encoded, opened
+from ihbench.datasets.visible_overlap import VisibleOverlap, visible_overlap, visible_problems
+from ihbench.errors import BadInput
+from ihbench.registry import nearest
+from ihbench.safe_pickle import load_pickle
+from ihbench.scene import BodyPose
+
+Array = NDArray[np.float64]
+
+SPLITS = ("train", "test")
+SILHOUETTES = ("visible", "mask")  # two names of one thing
+JPEG_QUALITY = 95
+SAME_CAMERA = 1e-4  # largest difference between frames, relative to the largest entry of K, R and t
+FARTHEST = 100.0  # m from the origin: the scenes are rooms
+LARGEST_ROTATION = 4 * np.pi  # rad of one joint; a fit may wind once around, degrees go further
+LISTED_PROBLEMS = 5  # of one kind, then "and so on"
+
+
+class OneCameraCapture(CaptureFolder):
+    """A person before one fixed camera, one image and one visible mask a frame. Keeps no images."""
+
+    dataset = "ocmotion"
+    variant: str
+    frame_names: tuple[str, ...]
+    _K: Array  # [3, 3] px, OpenCV's
+    _E: Array  # [4, 4] world to camera, m
+    _images: tuple[Path, ...]
+    _masks: tuple[Path, ...]
+    _annotated_size: tuple[int, int] | None = None  # px, width and height, where the format has them
+
+    def camera(self, camera: int) -> Camera:
+        """The calibrated view; no distortion."""
+        self.check_index(camera, 0)
+        return Camera.from_opencv(self._K, self._E[:3, :3], self._E[:3, 3], *self._image_size)
+
+    def body_pose(self, frame: int) -> BodyPose:
+        raise NotImplementedError
+
+    def vertices(self, frame: int) -> Array:
+        """[V, 3] m, world: the posed body. Needs the body model."""
+        body_pose = self.body_pose(frame)
+        return self.model.pose(body_pose)
+
+    def image(self, camera: int, frame: int) -> NDArray[np.uint8]:
+        """[H, W, 3] RGB, as stored."""
+        path = self.image_path(camera, frame)
+        if not path.is_file():
+            raise BadInput(f"{path}: no such file; expected the image of frame {frame}{self.standin_hint}")
+        image = decoded(path, "RGB")
+        self._check_size(path, image)
+        return image
+
+    def silhouette(self, camera: int, frame: int, source: str = "mask") -> NDArray[np.bool_]:
+        """[H, W] the visible person: what furniture hides is False. `source` is "visible" or, the same, "mask"."""
+        if source not in SILHOUETTES:
+            raise BadInput(f"silhouette source {source!r}: {nearest(source, list(SILHOUETTES))}")
+        path = self.mask_path(camera, frame)
+        if not path.is_file():
+            raise BadInput(f"{path}: no such file; {self._mask_hint}{self.standin_hint}")
+        with opened(path) as picture:
+            mode = picture.mode
+        mask = decoded(path, "RGB" if mode in ("P", "PA", "CMYK") else None)  # OccFusion reads the palette's red
+        self._check_size(path, mask)
+        return (mask if mask.ndim == 2 else mask[..., 0]) != 0
+
+    def content_digest(self, camera: int, frame: int, source: str = "mask") -> bytes:
+        """Hash of the bytes of a frame's image and mask file; a missing or unreadable one counts as empty."""
+        digest = hashlib.sha256()
+        for path in (self.image_path(camera, frame), self.mask_path(camera, frame)):
+            try:
+                content = path.read_bytes()
+            except OSError:
+                content = b""
+            digest.update(f"{len(content)} ".encode() + content)
+        return digest.digest()
+
+    def image_path(self, camera: int, frame: int) -> Path:
+        self.check_index(camera, frame)
+        return self._images[frame]
+
+    def mask_path(self, camera: int, frame: int) -> Path:
+        self.check_index(camera, frame)
+        return self._masks[frame]
+
+    _mask_hint = "expected the visible mask, non-zero where the person is seen"
+
+    @cached_property
+    def _image_size(self) -> tuple[int, int]:
+        """(width, height) px, as annotated, else of the first image on disk."""
+        if self._annotated_size is not None:
+            return self._annotated_size
+        path = next((path for path in self._images if path.is_file()), None)
+        if path is None:
+            raise BadInput(f"{self._images[0].parent}: no image in it; expected the frames{self.standin_hint}")
+        with opened(path) as picture:
+            return picture.size
+
+    def _check_size(self, path: Path, picture: NDArray) -> None:
+        width, height = self._image_size
+        if picture.shape[:2] != (height, width):
+            raise BadInput(
+                f"{path}: {picture.shape[1]}×{picture.shape[0]} px, but the camera's images are {width}×{height} px; "
+                f"expected one size for all images and masks, as the calibration has it"
+            )
+
+
+# ---------------------------------------------------------------------------------- the original layout
+
+
+class OcMotionOriginal:
+    """The folder that holds `annot/train.pkl` or `annot/test.pkl`.
+
+    A subject is one person before one camera, named after the folders of the images: "0011_02", and "0011_02_p1" for
+    a further person of the same images. The annotations of the whole release take minutes to read; they are read
+    once, when the first subject is asked for.
+    """
+
+    def __init__(self, root: Path):
+        """Raises `BadInput` when there is no annotation file; does not read them."""
+        self.root = Path(root).expanduser()
+        if not self.root.is_dir():
+            raise BadInput(f"{self.root}: no such folder; give the folder that holds OcMotion's annot/")
+        self._annots = [path for path in (self.root / "annot" / f"{split}.pkl" for split in SPLITS) if path.is_file()]
+        if not self._annots:
+            raise BadInput(f"{self.root}: no annot/train.pkl or annot/test.pkl in it{_where_else(self.root)}")
+
+    @staticmethod
+    def check(root: Path, body: Body | None = None) -> dict[str, Any]:
+        """What this copy is and what it lacks; see `checked` below."""
+        return checked(OcMotionOriginal(root), body)
+
+    def subjects(self) -> list[str]:
+        """Sorted names. Raises `BadInput` for annotations of another structure."""
+        return sorted(self._subjects)
+
+    def open(self, subject: str, body: Body | None = None) -> OcMotionCapture:
+        """One person before one camera. `body` is the SMPL model its poses belong to.
+
+        Raises `BadInput` for an unknown subject and for annotations that are incomplete or change their camera.
+        """
+        if subject not in self._subjects:
+            raise BadInput(f"{self.root}: no subject {subject!r}: {nearest(subject, self.subjects())}")
+        return OcMotionCapture(self.root, subject, self._subjects[subject], body)
+
+    @cached_property
+    def _subjects(self) -> dict[str, _Track]:
+        found: dict[str, _Track] = {}
+        for path in self._annots:
+            for name, track in _tracks(path).items():
+                found[f"{name}_{path.stem}" if name in found else name] = track
+        if not found:
+            raise BadInput(f"{self._annots[0]}: no person in any frame; expected the annotations of OcMotion")
+        return found
+
+
+class OcMotionCapture(OneCameraCapture):
+    """One person before one camera of the original release, read lazily; see `ihbench.scene.Capture`.
+
+    Its frames are those that annotate the person, in the order of the annotations.
+    """
+
+    variant = "original"
+    _mask_hint = (
+        "the OcMotion release has no visible masks: make them and put each one here, 8-bit, non-zero where the "
+        "person is seen"
+    )
+
+    def __init__(self, root: Path, name: str, track: _Track, body: Body | None = None):
+        super().__init__(root, name, body, root)
+        self.person = track.person
+        paths = [_image_name(frame, where) for frame, where in track.frames]
+        image, times = Counter(paths).most_common(1)[0]
+        if times > 1:
+            raise BadInput(
+                f"{track.path}: image {image} is listed {times} times for {name}; expected each frame once"
+            )
+        self.frame_names = tuple(PurePosixPath(path).stem for path in paths)
+        self.n_frames = len(paths)
+        self.camera_ids = (PurePosixPath(paths[0]).parent.name or "camera",)
+        self._images = tuple(root / path for path in paths)
+        self._masks = tuple(root / mask_file(path, track.suffix) for path in paths)
+        self._annotated_size = _one_size(track)
+        self._people = [(_person(frame, track.person, where), where) for frame, where in track.frames]
+        K = np.stack([numbers(person, "intri", (3, 3), where) for person, where in self._people])
+        E = np.stack([numbers(person, "extri", (4, 4), where) for person, where in self._people])
+        self._K, self._E = one_camera(K, E, [where for _, where in self._people])
+
+    def body_pose(self, frame: int) -> BodyPose:
+        """The frame's SMPL parameters: standard root, world, metres."""
+        person, where = self._at(frame)
+        return metric_pose(
+            numbers(person, "pose", (24, 3), where),
+            numbers(person, "betas", (10,), where),
+            numbers(person, "trans", (3,), where),
+            where,
+        )
+
+    def bbox(self, frame: int) -> Array:
+        """[2, 2] px: corners (x1, y1), (x2, y2) as stored."""
+        person, where = self._at(frame)
+        return numbers(person, "bbox", (2, 2), where)
+
+    def joints_2d(self, frame: int) -> Array:
+        """[n, 2 or more] px: `lsp_joints_2d` as stored, x and y first."""
+        person, where = self._at(frame)
+        return numbers(person, "lsp_joints_2d", (-1, -1), where)
+
+    def _at(self, frame: int) -> tuple[Mapping, str]:
+        self.check_index(0, frame)
+        return self._people[frame]
+
+
+@dataclass(frozen=True)
+class _Track:
+    """The frames of one person before one camera as they stand in an annotation file, their contents unchecked."""
+
+    path: Path
+    person: str  # its key in the frames
+    suffix: str  # of its mask files: "" for the first person of the images
+    frames: list[tuple[dict, str]]  # with the place, for messages: "annot/train.pkl: sequence 0, camera 1, frame 2"
+
+
+def _tracks(path: Path) -> dict[str, _Track]:
+    """Subjects of one annotation file."""
+    content = load_pickle(path)
+    found: dict[str, _Track] = {}
+    for s, cameras in enumerate(_listed(content, f"{path}", "a list of sequences")):
+        for c, frames in enumerate(_listed(cameras, f"{path}: sequence {s}", "a list of cameras")):
+            where = f"{path}: sequence {s}, camera {c}"
+            frames = _listed(frames, where, "a list of frames")
+            for f, frame in enumerate(frames):
+                if not isinstance(frame, dict) or not {"img_path", "h_w"} <= frame.keys():
+                    raise BadInput(
+                        f"{where}, frame {f}: expected a dictionary with img_path, h_w and one entry a person, "
+                        f"found {described(frame)}"
+                    )
+            people = sorted({str(key) for frame in frames for key in frame} - {"img_path", "h_w"}, key=_by_number)
+            for k, person in enumerate(people):
+                own = [(frame, f"{where}, frame {f}") for f, frame in enumerate(frames) if person in map(str, frame)]
+                suffix = f"_p{person}" if k else ""
+                folder = PurePosixPath(_image_name(*own[0])).parent
+                name = "_".join(_without_images(folder).parts) or f"{s:04d}_{c:02d}"
+                if name + suffix in found:
+                    raise BadInput(
+                        f"{where}: its images lie in {folder}, as do those of another camera of this file; "
+                        f"expected one folder for each camera"
+                    )
+                found[name + suffix] = _Track(path, person, suffix, own)
+    return found
+
+
+def _listed(value: Any, where: str, wanted: str) -> list:
+    if isinstance(value, np.ndarray) and value.dtype == object:
+        value = value.tolist()
+    if not isinstance(value, list | tuple):
+        raise BadInput(f"{where}: expected {wanted}, found {described(value)}; get OcMotion's annot/ again")
+    return list(value)
+
+
+def _by_number(key: str) -> tuple[int, str]:
+    return (int(key), "") if key.isdecimal() else (10**9, key)
+
+
+def _person(frame: dict, person: str, where: str) -> Mapping:
+    value = next(value for key, value in frame.items() if str(key) == person)
+    if not isinstance(value, dict):
+        raise BadInput(f"{where}: expected a dictionary for person {person}, found {described(value)}")
+    return value
+
+
+def _image_name(frame: dict, where: str) -> str:
+    """The image's path below the root. Raises `BadInput` when it leads out of it."""
+    path = frame["img_path"]
+    if not isinstance(path, str) or not path.strip():
+        raise BadInput(f"{where}: expected the image's path in 'img_path', found {described(path)}")
+    path = path.replace("\\", "/")  # annotations were made on Windows, too
+    if path.startswith("/") or path[1:2] == ":" or "\0" in path or ".." in path.split("/"):
+        raise BadInput(f"{where}: img_path {path!r} leads out of the data folder; expected a path below it")
+    return PurePosixPath(path).as_posix()
+
+
+def _height_width(frame: dict, where: str) -> tuple[int, int]:
+    try:
+        height, width = (int(side) for side in frame["h_w"])
+    except (TypeError, ValueError, OverflowError):
+        height = width = 0
+    if height < 1 or width < 1:
+        raise BadInput(f"{where}: expected (height, width) px in 'h_w', found {str(frame['h_w'])[:60]!r}")
+    return height, width
+
+
+def _one_size(track: _Track) -> tuple[int, int]:
+    """(width, height) px of all frames."""
+    height, width = _height_width(*track.frames[0])
+    for frame, where in track.frames:
+        if _height_width(frame, where) != (height, width):
+            raise BadInput(
+                f"{where}: h_w is {frame['h_w']}, ({height}, {width}) at the first frame; expected one image size "
+                f"for a camera"
+            )
+    return width, height
+
+
+def mask_file(img_path: str, suffix: str = "") -> str:
+    """Where the visible mask of an image belongs; `suffix` is "_p1" for a further person "1"."""
+    path = _without_images(PurePosixPath(img_path))
+    return (PurePosixPath("masks") / path.with_name(f"{path.stem}{suffix}.png")).as_posix()
+
+
+def _without_images(path: PurePosixPath) -> PurePosixPath:
+    return PurePosixPath(*path.parts[1:]) if path.parts[:1] == ("images",) else path
+
+
+def _where_else(root: Path) -> str:
+    below = next((path.parent.parent for path in sorted(root.glob("*/annot/*.pkl"))), None)
+    if below is not None:
+        return f"; there is one in {below}, give that folder"
+    if (root / "metadata.json").is_file() or any(root.glob("*/metadata.json")):
+        return "; this looks like `_w2a` sequences (metadata.json), expected the original release"
+    return "; expected the original OcMotion release, unpacked"
+
+
+# ------------------------------------------------------------------------------- checked values of both
+
+
+def numbers(content: Mapping, key: str, shape: tuple[int, ...], where: str) -> Array:
+    """One entry as finite float64 of a shape, where -1 is any length. Rows and columns pass as vectors, 72 numbers as
+    [24, 3]. Raises `BadInput` that starts with `where`."""
+    sides = ", ".join("n" if side < 0 else str(side) for side in shape)
+    wanted = f"expected {key!r} to be numbers of shape [{sides}]"
+    if key not in content:
+        raise BadInput(f"{where}: {wanted}, found no such key")
+    try:
+        value = np.asarray(content[key], np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise BadInput(f"{where}: {wanted}, found {described(content[key])} of other contents") from None
+    if shape == (24, 3) and value.size == 72:
+        value = value.reshape(24, 3)
+    if not _fits(value.shape, shape):
+        if not _fits(value.squeeze().shape, shape):
+            raise BadInput(f"{where}: {wanted}, found {list(value.shape)}")
+        value = value.squeeze()
+    if not np.isfinite(value).all():
+        raise BadInput(f"{where}: NaN or infinity in {key!r}; expected finite numbers, leave this frame out")
+    return value
+
+
+def _fits(found: tuple[int, ...], wanted: tuple[int, ...]) -> bool:
+    return len(found) == len(wanted) and all(a == b or (b < 0 < a) for a, b in zip(found, wanted, strict=True))
+
+
+def metric_pose(pose: Array, betas: Array, trans: Array, where: str) -> BodyPose:
+    """SMPL parameters in radians and metres. Raises `BadInput` for those that are in degrees or millimetres."""
+    turn = np.linalg.norm(pose, axis=1).max()
+    if turn > LARGEST_ROTATION:
+        raise BadInput(
+            f"{where}: a joint turned by {turn:.3g} rad; expected axis-angle rotations in radians, convert them if "
+            f"these are degrees"
+        )
+    if np.abs(trans).max() > FARTHEST:
+        raise BadInput(
+            f"{where}: the body stands {np.abs(trans).max():.4g} from the origin; expected metres, divide 'trans' by "
+            f"1000 if it is in millimetres"
+        )
+    return BodyPose(pose, betas, trans)
+
+
+def one_camera(K: Array, E: Array, where: Sequence[str]) -> tuple[Array, Array]:
+    """The first of K [N, 3, 3] and E [N, 4, 4], checked, when all frames have that camera. Raises `BadInput`."""
+    check_calibration(K[0], E[0], where[0])
+    differences = np.zeros(len(K))
+    for value in (K, E[:, :3, :3], E[:, :3, 3], E[:, 3]):
+        value = value.reshape(len(K), -1)
+        # t counts from 1 m: a camera at the origin has no size to compare with
+        differences = np.maximum(differences, np.abs(value - value[0]).max(1) / max(1.0, np.abs(value[0]).max()))
+    other = int(differences.argmax())
+    if differences[other] > SAME_CAMERA:
+        raise BadInput(
+            f"{where[other]}: its camera differs from the first frame's by {differences[other]:.2g} (relative); "
+            f"expected one fixed camera for all frames"
+        )
+    return K[0], E[0]
+
+
+def check_calibration(K: Array, E: Array, where: str) -> None:
+    """Raise `BadInput` unless K is a pinhole's and E a rigid world-to-camera transform in metres."""
+    if K[0, 0] <= 0 or K[1, 1] <= 0 or np.abs(K[2] - [0, 0, 1]).max() > 1e-6 or abs(K[1, 0]) > 1e-6:
+        raise BadInput(f"{where}: expected intrinsics [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] px, found another matrix")
+    R = E[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0 or np.abs(E[3] - [0, 0, 0, 1]).max() > 1e-6:
+        raise BadInput(f"{where}: expected extrinsics [[R, t], [0, 1]] with a rotation R, found another matrix")
+    if np.linalg.norm(E[:3, 3]) > FARTHEST:
+        raise BadInput(
+            f"{where}: the camera stands {np.linalg.norm(E[:3, 3]):.4g} from the origin; expected metres, divide the "
+            f"extrinsics' t by 1000 if it is in millimetres"
+        )
+
+
+def described(value: object) -> str:
+    if isinstance(value, dict):
+        keys = sorted(str(key)[:20] for key in value)
+        return f"a dictionary with {', '.join(keys[:6]) or 'nothing'}{', …' if len(keys) > 6 else ''}"
+    if isinstance(value, np.ndarray):
+        return f"a {value.dtype} array of shape {list(value.shape)}"
+    return f"a {type(value).__name__}"
+
+
+# ----------------------------------------------------------------------------------------------- check
+
+
+class _Sequences(Protocol):
+    root: Path
+
+    def subjects(self) -> list[str]: ...
+
+    def open(self, subject: str, body: Body | None = None) -> OneCameraCapture: ...
+
+
+def check(root: Path, body: Body | None = None, samples: int = 3) -> dict[str, Any]:
+    """`checked` for the original layout. Raises `BadInput` when the root is not of this layout at all."""
+    return checked(OcMotionOriginal(root), body, samples)
+
+
+def checked(dataset: _Sequences, body: Body | None = None, samples: int = 3) -> dict[str, Any]:
+    """What a copy is and what it lacks, for `ihbench data check`.
+
+    Lists files, reads every pose, decodes `samples` frames a subject. `mask_in_body` is the share of the visible
+    masks that lies on the projected body, over the sampled frames: below 0.9 means masks that are mirrored or
+    inverted, or wrong cameras, units or parameters. `vertices_in_mask` is for information, since furniture hides
+    vertices. Both need the body model: a stand-in has its own, real captures need `body`, the SMPL model.
+    """
+    subjects = [_check_subject(dataset, name, samples, body) for name in dataset.subjects()]
+    return {
+        "dataset": OneCameraCapture.dataset,
+        "layout": "original" if isinstance(dataset, OcMotionOriginal) else "w2a",
+        "root": str(dataset.root),
+        "standin": next((subject["standin"] for subject in subjects if subject.get("standin")), ""),
+        "subjects": subjects,
+        "ok": not any(subject["problems"] for subject in subjects),
+    }
+
+
+def _check_subject(dataset: _Sequences, name: str, samples: int, body: Body | None) -> dict[str, Any]:
+    problems: list[str] = []
+    found: dict[str, Any] = {"subject": name, "problems": problems}
+    try:
+        capture = dataset.open(name)
+        model = capture.model if capture.standin else body
+    except BadInput as error:
+        problems.append(str(error))
+        return found
+    frames = range(capture.n_frames)
+    listed = _listing({path.parent for f in frames for path in (capture.image_path(0, f), capture.mask_path(0, f))})
+    there = {
+        "image": {frame for frame in frames if capture.image_path(0, frame) in listed},
+        "mask": {frame for frame in frames if capture.mask_path(0, frame) in listed},
+    }
+    missing = {kind: capture.n_frames - len(present) for kind, present in there.items()}
+    found |= {
+        "standin": capture.standin,
+        "body": capture.body,
+        "variant": capture.variant,
+        "cameras": 1,
+        "frames": capture.n_frames,
+        "files": {kind: len(present) for kind, present in there.items()},
+        "missing": missing,
+    }
+    if not capture.standin:
+        problems += [f"{n} of {what} missing" for what, n in missing.items() if n]
+    poses: dict[int, BodyPose] = {}
+    unreadable = []
+    for frame in frames:
+        try:
+            poses[frame] = capture.body_pose(frame)
+        except BadInput as error:
+            unreadable.append(str(error))
+    problems += unreadable[:LISTED_PROBLEMS]
+    if len(unreadable) > LISTED_PROBLEMS:
+        problems.append(f"and so on: the body's parameters are unusable at {len(unreadable)} frames")
+    complete = sorted(there["image"] & there["mask"])
+    if complete:
+        _sample(capture, complete, poses, samples, model, found, problems)
+    else:
+        problems.append("no image with its mask found")
+    return found
+
+
+def _listing(folders: set[Path]) -> set[Path]:
+    return {path for folder in folders if folder.is_dir() for path in folder.iterdir()}
+
+
+def _sample(
+    capture: OneCameraCapture,
+    complete: list[int],
+    poses: dict[int, BodyPose],
+    samples: int,
+    body: Body | None,
+    found: dict[str, Any],
+    problems: list[str],
+) -> None:
+    """Decode a few frames and compare their masks with the projected body."""
+    from scipy.ndimage import binary_dilation
+
+    overlaps: list[VisibleOverlap] = []
+    inside, sizes, n_decoded, n_empty = [], set(), 0, 0
+    for frame in sorted({complete[i] for i in np.linspace(0, len(complete) - 1, samples).astype(int)}):
+        try:
+            height, width, _ = capture.image(0, frame).shape
+            sizes.add((width, height))
+            silhouette = capture.silhouette(0, frame)
+            camera = capture.camera(0)
+        except BadInput as error:
+            problems.append(str(error))
+            continue
+        n_decoded += 1
+        n_empty += not silhouette.any()
+        if body is None or frame not in poses or not silhouette.any():
+            continue
+        grown = np.asarray(binary_dilation(silhouette, iterations=max(1, width // 100)), bool)
+        inside.append(share_inside(camera.project(body.pose(poses[frame])), grown))
+        overlaps.append(visible_overlap(body, poses[frame], camera, silhouette))
+    found["sampled_images"] = n_decoded
+    found["image_size"] = sorted([list(size) for size in sizes])
+    if overlaps:
+        found["vertices_in_mask"] = round(float(np.mean(inside)), 4)
+        found["mask_in_body"] = round(float(np.mean([overlap.inside for overlap in overlaps])), 4)
+        problems += visible_problems(overlaps)
+    if n_decoded and n_empty == n_decoded:
+        problems.append("the masks of all sampled frames are empty; expected non-zero where the person is seen")
+
+
+# ----------------------------------------------------------------------------------------------- write
+
+
+@dataclass(frozen=True)
+class AnnotPerson:
+    """One person in one image."""
+
+    body_pose: BodyPose  # standard root, world, 10 shape coefficients
+    bbox: NDArray[np.floating]  # [2, 2] px, (x1, y1) and (x2, y2)
+    joints_2d: NDArray[np.floating]  # [n, 2 or more] px, x and y first
+
+
+@dataclass(frozen=True)
+class AnnotFrame:
+    """One image of the annotations."""
+
+    img_path: str  # relative to the data folder, e.g. images/0011/02/00001.jpg
+    camera: Camera  # without distortion
+    people: Mapping[str, AnnotPerson]  # keys "0", "1", …
+
+
+def write_annot(path: Path, sequences: Sequence[Sequence[Sequence[AnnotFrame]]]) -> None:
+    """annot/train.pkl or annot/test.pkl: [sequence][camera][frame]. `OcMotionOriginal` reads it back exactly."""
+    write_pickle(path, [[[_entry(frame) for frame in camera] for camera in sequence] for sequence in sequences])
+
+
+def _entry(frame: AnnotFrame) -> dict[str, Any]:
+    K, E = stored_camera(frame.camera)
+    people = {
+        key: {
+            "bbox": np.array(person.bbox, np.float64),
+            "lsp_joints_2d": np.array(person.joints_2d, np.float64),
+            "pose": person.body_pose.pose.reshape(72).copy(),
+            "betas": ten_betas(person.body_pose),
+            "trans": person.body_pose.transl.copy(),
+            "intri": K.copy(),
+            "extri": E.copy(),
+        }
+        for key, person in frame.people.items()
+    }
+    return {"img_path": frame.img_path, "h_w": (frame.camera.height, frame.camera.width), **people}
+
+
+def write_frame(
+    root: Path,
+    img_path: str,  # as the annotations list it
+    image: NDArray[np.uint8] | None = None,  # [H, W, 3] RGB
+    visible_mask: NDArray | None = None,  # [H, W] non-zero = visible person
+    suffix: str = "",  # "_p1" for the mask of a further person "1"
+) -> None:
+    """The picture files of one frame: the image as its name says (JPEG of quality 95, or PNG), the mask as 8-bit PNG
+    of three channels, 0 and 255. None is not written."""
+    if image is not None:
+        jpeg = PurePosixPath(img_path).suffix.lower() in (".jpg", ".jpeg")
+        options = {"quality": JPEG_QUALITY} if jpeg else {"compress_level": 3}
+        atomic.write_bytes(root / img_path, encoded(image, "JPEG" if jpeg else "PNG", **options), durable=False)
+    if visible_mask is not None:
+        atomic.write_bytes(root / mask_file(img_path, suffix), mask_png(visible_mask), durable=False)
+
+
+def mask_png(mask: NDArray) -> bytes:
+    """A mask [H, W] as PNG of three equal channels, 255 where it is non-zero: OccFusion takes channel 0."""
+    grey = np.where(np.asarray(mask) != 0, 255, 0).astype(np.uint8)
+    return encoded(np.repeat(grey[..., None], 3, 2), "PNG", compress_level=3)
+
+
+def stored_camera(camera: Camera) -> tuple[Array, Array]:
+    """K [3, 3] px with integer pixel centres and E [4, 4] world to camera, m. Raises `ValueError` for a camera with
+    distortion, which OcMotion cannot keep."""
+    if camera.distortion is not None and camera.distortion.any():
+        raise ValueError("OcMotion: expected a camera without distortion")
+    E = np.eye(4)
+    E[:3, :3], E[:3, 3] = camera.R, camera.t
+    return camera.K_opencv, E
+
+
+def ten_betas(body_pose: BodyPose) -> Array:
+    """[10] the shape coefficients, filled up with zeros. Raises `ValueError` when there are more."""
+    if body_pose.betas[10:].any():
+        raise ValueError(f"OcMotion: expected at most 10 shape coefficients, got {len(body_pose.betas)}")
+    return np.concatenate([body_pose.betas, np.zeros(10)])[:10]

@@ -1,0 +1,791 @@
+"""PeopleSnapshot as it was released: read, check and write one folder a subject, e.g. `male-3-casual`.
+
+    <subject>.mp4                the video of the one camera, lens distortion in
+    camera.pkl                   camera_f, camera_c (2), camera_k (5, OpenCV), camera_t, camera_rt (3), width, height
+    masks.hdf5                   masks [N, H, W], 1 = person
+    reconstructed_poses.hdf5     pose [M, 72] rad, trans [M, 3] m, betas [10], standard SMPL root
+    consensus.pkl                betas [10], v_personal [6890, 3] m; not used here
+    keypoints.hdf5               keypoints [N, 54], 18 OpenPose joints of (x px, y px, confidence); not used here
+
+Sources: thmoa/videoavatars prepare_data/ and step1_pose.py, zju3dv/neuralbody tools/process_snapshot.py,
+tijiang13/InstantAvatar scripts/peoplesnapshot/. The poses belong to the gendered SMPL models. There may be more poses
+than masks: NeuralBody pairs the masks with the last poses, InstantAvatar with the first. Where a body model is at
+hand the silhouettes decide (`PeopleSnapshotCapture.alignment`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import tempfile
+import threading
+import zipfile
+import zlib
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench import atomic
+from ihbench.body import Body
+from ihbench.body.skinning_numpy import axis_angle_to_matrix
+from ihbench.camera import Camera
+from ihbench.datasets.capture_folder import CaptureFolder
+from ihbench.datasets.overlap import Overlap, overlap_of, overlap_problems, share_inside
+from ihbench.datasets.pickles import write_pickle
+from ihbench.datasets.pictures import one_line
+from ihbench.errors import BadInput
+from ihbench.registry import nearest
+from ihbench.safe_pickle import load_pickle
+from ihbench.scene import BodyPose
+
+if TYPE_CHECKING:
+    import h5py
+
+CAMERA_FILE, MASKS_FILE, POSES_FILE = "camera.pkl", "masks.hdf5", "reconstructed_poses.hdf5"
+CONSENSUS_FILE, KEYPOINTS_FILE = "consensus.pkl", "keypoints.hdf5"
+CAMERA_SIZES = {"camera_f": 2, "camera_c": 2, "camera_k": 5, "camera_t": 3, "camera_rt": 3, "width": 1, "height": 1}
+N_KEYPOINTS = 18
+KEPT_PICTURES = 4
+CHUNK_CACHE = 64 << 20  # bytes; the released masks are stored in chunks of many frames
+COMPARED_FRAMES = 5
+CLEARLY_BETTER = 0.002  # share of vertices by which the last poses must beat the first
+
+
+class PeopleSnapshotRaw:
+    """A folder that holds subjects' folders of the released layout, or one of those folders itself."""
+
+    layout = "raw"
+
+    def __init__(self, root: Path):
+        """Raises `BadInput` when there is no such folder, or nothing of this layout in it."""
+        self.root = Path(root).expanduser()
+        self._folders = subject_folders(
+            self.root, holds_raw, f"the released PeopleSnapshot layout ({CAMERA_FILE}, {MASKS_FILE}, {POSES_FILE})"
+        )
+
+    @staticmethod
+    def check(root: Path, body: Body | None = None) -> dict[str, Any]:
+        """What this copy is and what it lacks; see `check` below."""
+        return check(root, body=body)
+
+    def subjects(self) -> list[str]:
+        """Names of the folders, sorted."""
+        return sorted(self._folders)
+
+    def open(self, subject: str, body: Body | None = None) -> PeopleSnapshotCapture:
+        """One subject. Reads the camera, the poses and the headers of video and masks.
+
+        `body` is the SMPL model of the subject's gender; it decides which of surplus poses belong to the masks.
+        Raises `BadInput` for an unknown subject or a damaged one.
+        """
+        return PeopleSnapshotCapture(chosen_folder(self.root, self._folders, subject), body)
+
+
+class SnapshotFolder(CaptureFolder):
+    """What the layouts of PeopleSnapshot share: one camera, one kind of silhouette, a gender in the name."""
+
+    dataset = "people_snapshot"
+    camera_ids = ("camera",)
+
+    @property
+    def gender(self) -> str:
+        """ "female" or "male" by the folder's name, else "neutral": the SMPL model that the poses belong to."""
+        words = re.split(r"[^a-z]+", self.name.lower())
+        return next((word for word in words if word in ("female", "male")), "neutral")
+
+    @property
+    def has_body(self) -> bool:
+        """Whether `model` can be read without an error about a body that was not given."""
+        return self._given_body is not None or bool(self._mark)
+
+    def check_source(self, source: str) -> None:
+        """Raise `BadInput` for another silhouette source than "mask"."""
+        if source != "mask":
+            raise BadInput(f"silhouette source {source!r}: {nearest(source, ['mask'])}")
+
+    def check_size(self, path: Path, picture: NDArray, camera: Camera) -> None:
+        """Raise `BadInput` when a picture or mask [H, W, …] is not of the camera's size."""
+        if picture.shape[:2] != (camera.height, camera.width):
+            raise BadInput(
+                f"{path}: {picture.shape[1]}×{picture.shape[0]} px, but the camera is {camera.width}×{camera.height} "
+                f"px; expected images and masks of the camera's size, make them anew"
+            )
+
+
+class PeopleSnapshotCapture(SnapshotFolder):
+    """One subject, read lazily; see `ihbench.scene.Capture`. Keeps the last few decoded frames."""
+
+    def __init__(self, folder: Path, body: Body | None = None):
+        super().__init__(folder, folder.name, body)
+        self._camera = read_camera(folder / CAMERA_FILE)
+        self._masks = MaskFile(folder / MASKS_FILE)
+        self._poses = read_poses(folder / POSES_FILE)
+        self.video = Video(video_path(folder))
+        expected = self._camera.height, self._camera.width
+        for path, size in ((self._masks.path, self._masks.shape[1:]), (self.video.path, self.video.size)):
+            if size != expected:
+                raise BadInput(
+                    f"{path}: {size[1]}×{size[0]} px, but {CAMERA_FILE} says {expected[1]}×{expected[0]} px; "
+                    f"expected one size, copy both files again"
+                )
+        self.n_masks, self.n_poses = self._masks.shape[0], len(self._poses[0])
+        self.n_frames = min(self.video.n_frames, self.n_masks, self.n_poses)
+        self._file_digests: dict[Path, tuple[tuple[int, int], bytes]] = {}
+
+    @property
+    def variant(self) -> str:
+        return f"{PeopleSnapshotRaw.layout}/{self.alignment}"
+
+    @property
+    def alignment(self) -> str:
+        """Which poses belong to the masks: "equal" (as many), or the "first" or "last" of more poses.
+
+        With a body model the overlap of its vertices with the silhouettes decides; without one it is "first".
+        """
+        if self.n_poses == self.n_masks:
+            return "equal"
+        shares = self.alignment_shares
+        return "last" if shares and shares["last"] > shares["first"] + CLEARLY_BETTER else "first"
+
+    @cached_property
+    def alignment_shares(self) -> dict[str, float]:
+        """The share of vertices in the silhouettes under both alignments; empty without a choice or a body model.
+
+        Taken over the frames where the two differ most, since a body that stands still fits either way.
+        """
+        surplus = self.n_poses - self.n_masks
+        if surplus <= 0 or not self.has_body:
+            return {}
+        pose, trans, _ = self._poses
+        candidates = np.unique(np.linspace(0, self.n_frames - 1, 64).astype(int))
+        change = np.abs(pose[candidates] - pose[candidates + surplus]).sum(1)
+        change += 10 * np.abs(trans[candidates] - trans[candidates + surplus]).sum(1)
+        candidates, change = candidates[np.isfinite(change)], change[np.isfinite(change)]
+        frames = candidates[np.argsort(-change, kind="stable")[:COMPARED_FRAMES]].tolist()
+        if not frames:
+            return {}
+        shares = {}
+        for name, offset in (("first", 0), ("last", surplus)):
+            points = [self._camera.project(self.model.pose(self._stored_pose(frame + offset))) for frame in frames]
+            found = [share_inside(p, self.silhouette(0, f)) for p, f in zip(points, frames, strict=True)]
+            shares[name] = float(np.mean(found))
+        return shares
+
+    def camera(self, camera: int) -> Camera:
+        """The one camera, with its lens distortion."""
+        self.check_index(camera, 0)
+        return self._camera
+
+    def body_pose(self, frame: int) -> BodyPose:
+        """The frame's SMPL parameters (standard root convention), by `alignment`."""
+        self.check_index(0, frame)
+        return self._stored_pose(frame + (self.n_poses - self.n_masks if self.alignment == "last" else 0))
+
+    def _stored_pose(self, index: int) -> BodyPose:
+        return finite_pose(self.folder / POSES_FILE, index, *self._poses)
+
+    def image(self, camera: int, frame: int) -> NDArray[np.uint8]:
+        """[H, W, 3] RGB, decoded from the video. Fast when frames are asked for in order."""
+        self.check_index(camera, frame)
+        image = self.video.frame(frame)
+        self.check_size(self.video.path, image, self._camera)
+        return image
+
+    def silhouette(self, camera: int, frame: int, source: str = "mask") -> NDArray[np.bool_]:
+        """[H, W]. `source` is "mask"."""
+        self.check_index(camera, frame)
+        self.check_source(source)
+        return self._masks.frame(frame)
+
+    def content_digest(self, camera: int, frame: int, source: str = "mask") -> bytes:
+        """Hash of the video file, the mask file and the frame number: frames have no bytes of their own in either."""
+        self.check_index(camera, frame)
+        digest = hashlib.sha256(f"{source} {frame}".encode())
+        for path in (self.video.path, self._masks.path):
+            digest.update(self._file_digest(path))
+        return digest.digest()
+
+    def _file_digest(self, path: Path) -> bytes:
+        try:
+            state = path.stat()
+            stamp = state.st_size, state.st_mtime_ns
+            known = self._file_digests.get(path)
+            if known is None or known[0] != stamp:
+                with path.open("rb") as file:
+                    known = self._file_digests[path] = stamp, hashlib.file_digest(file, "sha256").digest()
+            return known[1]
+        except OSError:
+            return b""
+
+
+def holds_raw(folder: Path) -> bool:
+    """Whether a folder is a subject of the released layout, perhaps with one of its files missing."""
+    return sum((folder / name).is_file() for name in (CAMERA_FILE, MASKS_FILE, POSES_FILE)) >= 2
+
+
+def subject_folders(root: Path, holds: Callable[[Path], bool], wanted: str) -> dict[str, Path]:
+    """Name -> folder of the subjects in root, or of root itself. Raises `BadInput` when there is none."""
+    if not root.is_dir():
+        raise BadInput(f"{root}: no such folder; give the folder that holds the subjects' folders")
+    itself = root.absolute()  # "." may be a subject's folder
+    try:
+        inside = [itself] if holds(itself) else [folder for folder in sorted(itself.iterdir()) if folder.is_dir()]
+        found = {folder.name: folder for folder in inside if not folder.name.startswith(".") and holds(folder)}
+        below = None if found else next((path.parent for path in itself.glob("*/*/") if holds(path)), None)
+    except OSError as error:
+        raise BadInput(f"{root}: cannot be listed ({error.strerror}); expected a readable folder") from error
+    if not found:
+        hint = f"there is one in {below}, give that folder" if below else f"expected {wanted}"
+        raise BadInput(f"{root}: no subject of this layout in it; {hint}")
+    return found
+
+
+def chosen_folder(root: Path, folders: dict[str, Path], subject: str) -> Path:
+    """The subject's folder. Raises `BadInput` with the nearest known name."""
+    if subject not in folders:
+        raise BadInput(f"{root}: no subject {subject!r}: {nearest(subject, sorted(folders))}")
+    return folders[subject]
+
+
+def video_path(folder: Path) -> Path:
+    """`<subject>.mp4`, or the only .mp4 of a folder that was renamed. Raises `BadInput` when there is none."""
+    path = folder / f"{folder.name}.mp4"
+    if path.is_file():
+        return path
+    others = [other for other in sorted(folder.glob("*.mp4")) if not other.name.startswith(".")]
+    if len(others) == 1:
+        return others[0]
+    found = f"{len(others)} other .mp4 files, none of this name" if others else "no .mp4 file"
+    raise BadInput(f"{path}: no such file; expected the subject's video, found {found}; copy it here")
+
+
+# ---------------------------------------------------------------------------------------------- the files
+
+
+def read_camera(path: Path) -> Camera:
+    """The camera of camera.pkl with its lens distortion. Raises `BadInput` naming the entry that is not as expected.
+
+    `camera_t` m and `camera_rt` rad (world to camera) are zeros in the release, and when they are missing.
+    """
+    if not path.is_file():
+        raise BadInput(f"{path}: no such file; expected the camera's parameters in it")
+    content = load_pickle(path)
+    if not isinstance(content, dict):
+        raise BadInput(f"{path}: expected a dictionary with camera_f, camera_c, …, found a {type(content).__name__}")
+    content = {"camera_t": np.zeros(3), "camera_rt": np.zeros(3)} | content
+    values = {key: _numbers(content, key, size, path) for key, size in CAMERA_SIZES.items()}
+    width, height = float(values["width"][0]), float(values["height"][0])
+    if not (width.is_integer() and height.is_integer() and 1 <= width <= 65535 and 1 <= height <= 65535):
+        raise BadInput(f"{path}: expected width and height in whole pixels, found {width:g} and {height:g}")
+    focal, centre = values["camera_f"], values["camera_c"]
+    if (focal <= 0).any():
+        raise BadInput(f"{path}: expected positive focal lengths in 'camera_f', found {focal.tolist()}")
+    K = np.array([[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1]])
+    R = axis_angle_to_matrix(values["camera_rt"])
+    return Camera.from_opencv(K, R, values["camera_t"], int(width), int(height), values["camera_k"])
+
+
+def _numbers(content: dict, key: str, size: int, path: Path) -> NDArray[np.float64]:
+    wanted = f"expected {size} number{'s' if size > 1 else ''} in {key!r}"
+    if key not in content:
+        raise BadInput(f"{path}: {wanted}, found no such key; copy the file again")
+    try:
+        value = np.asarray(content[key], np.float64).reshape(-1)
+    except (TypeError, ValueError):
+        raise BadInput(f"{path}: {wanted}, found a {type(content[key]).__name__}") from None
+    if value.size != size:
+        raise BadInput(f"{path}: {wanted}, found {value.size}")
+    if not np.isfinite(value).all():
+        raise BadInput(f"{path}: {wanted}, found NaN or infinity in it")
+    return value
+
+
+def read_poses(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """(pose [M, 72] rad, trans [M, 3] m, betas [10]); poses may hold NaN. Raises `BadInput` for other shapes."""
+    with _hdf5(path) as file:
+        pose, trans = (_read_dataset(file, name, (None, n), path) for name, n in (("pose", 72), ("trans", 3)))
+        betas = _read_dataset(file, "betas", None, path).reshape(-1)
+    if len(pose) != len(trans) or not len(pose):
+        raise BadInput(f"{path}: expected one 'trans' for each 'pose', found {len(pose)} poses, {len(trans)} trans")
+    if betas.size != 10:
+        raise BadInput(f"{path}: expected 10 numbers in 'betas', found {betas.size}")
+    if not np.isfinite(betas).all():
+        raise BadInput(f"{path}: NaN or infinity in 'betas'; expected finite numbers, copy the file again")
+    return pose, trans, betas
+
+
+def finite_pose(path: Path, index: int, pose: NDArray, trans: NDArray, betas: NDArray) -> BodyPose:
+    """Row `index` of pose [M, 72] and trans [M, 3]. Raises `BadInput` when it holds NaN or infinity."""
+    for name, value in (("pose", pose[index]), ("trans", trans[index]), ("betas", betas)):
+        if not np.isfinite(value).all():
+            raise BadInput(f"{path}: NaN or infinity in the {name} of row {index}; leave this frame out")
+    return BodyPose(pose[index].reshape(24, 3), betas, trans[index])
+
+
+def read_consensus(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(betas [10], v_personal [V, 3] m: offsets of the template's vertices). Raises `BadInput`."""
+    content = load_pickle(path)
+    if not isinstance(content, dict) or not {"betas", "v_personal"} <= content.keys():
+        raise BadInput(f"{path}: expected a dictionary with 'betas' and 'v_personal', found something else")
+    betas = _numbers(content, "betas", 10, path)
+    v_personal = content["v_personal"]
+    if not isinstance(v_personal, np.ndarray) or v_personal.ndim != 2 or v_personal.shape[1] != 3:
+        raise BadInput(f"{path}: expected an array of shape [V, 3] in 'v_personal', found something else")
+    return betas, _numbers(content, "v_personal", v_personal.size, path).reshape(-1, 3)
+
+
+def read_keypoints(path: Path) -> NDArray[np.float64]:
+    """[N, 18, 3]: x px, y px (OpenCV's integer pixel centres), confidence. Raises `BadInput`."""
+    with _hdf5(path) as file:
+        return _read_dataset(file, "keypoints", (None, 3 * N_KEYPOINTS), path).reshape(-1, N_KEYPOINTS, 3)
+
+
+def read_npz(path: Path, wanted: dict[str, tuple[int | None, ...] | None]) -> dict[str, NDArray]:
+    """Arrays of numbers from an .npz file by name; a shape's None stands for any length, a shape None for any shape.
+
+    A name that ends in "?" may be missing. Raises `BadInput` for a damaged file, a missing name or another shape.
+    """
+    if not path.is_file():
+        raise BadInput(f"{path}: no such file; expected {', '.join(name.rstrip('?') for name in wanted)} in it")
+    found = {}
+    try:
+        content = np.load(path, allow_pickle=False)
+        if not isinstance(content, np.lib.npyio.NpzFile):
+            raise BadInput(f"{path}: expected an .npz file, found a single array; copy the file again")
+        with content:
+            for name in wanted:
+                key = name.rstrip("?")
+                if key in content.files:
+                    found[key] = content[key]
+                elif not name.endswith("?"):
+                    names = ", ".join(sorted(content.files)) or "nothing"
+                    raise BadInput(f"{path}: expected {key!r} in it, found {names}")
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
+        raise BadInput(f"{path}: damaged, or not an .npz file of plain arrays ({one_line(error)})") from error
+    for name, shape in wanted.items():
+        array = found.get(name.rstrip("?"))
+        if array is not None:
+            _check_array(array.dtype, array.shape, shape, f"{path}: expected {name.rstrip('?')!r}")
+    return found
+
+
+def rigid_extrinsic(extrinsic: NDArray, path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(R [3, 3], t [3] m) of a world-to-camera matrix [4, 4] or [3, 4]. Raises `BadInput` when it is not rigid."""
+    if extrinsic.shape not in ((4, 4), (3, 4)):
+        raise BadInput(f"{path}: expected 'extrinsic' of shape [4, 4], found {list(extrinsic.shape)}")
+    extrinsic = extrinsic.astype(np.float64)
+    if not np.isfinite(extrinsic).all():
+        raise BadInput(f"{path}: NaN or infinity in 'extrinsic'; expected finite numbers, copy the file again")
+    R = extrinsic[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
+        raise BadInput(f"{path}: expected a rotation (right-handed, no scale) in 'extrinsic', found another matrix")
+    return R, extrinsic[:3, 3]
+
+
+def _check_array(dtype: np.dtype, shape: tuple[int, ...], wanted: tuple[int | None, ...] | None, start: str) -> None:
+    if dtype.kind not in "biuf":
+        raise BadInput(f"{start} to hold numbers, found {dtype}")
+    fits = wanted is None or (
+        len(shape) == len(wanted) and all(b in (None, a) for a, b in zip(shape, wanted, strict=True))
+    )
+    if not fits:
+        assert wanted is not None
+        spelled = ", ".join("N" if n is None else str(n) for n in wanted)
+        raise BadInput(f"{start} of shape [{spelled}], found {list(shape)}")
+
+
+def _hdf5(path: Path) -> h5py.File:
+    try:
+        import h5py
+    except ImportError:
+        raise BadInput(f"{path}: reading HDF5 files needs the package h5py; run: pip install h5py") from None
+    if not path.is_file():
+        raise BadInput(f"{path}: no such file; expected an HDF5 file of the PeopleSnapshot release")
+    try:
+        return h5py.File(path, "r", locking=False, rdcc_nbytes=CHUNK_CACHE)  # locks fail on read-only network disks
+    except (OSError, RuntimeError, ValueError) as error:
+        raise BadInput(f"{path}: cut short, or not an HDF5 file ({one_line(error)}); copy the file again") from error
+
+
+def _dataset(file: h5py.File, name: str, shape: tuple[int | None, ...] | None, path: Path) -> h5py.Dataset:
+    import h5py
+
+    try:
+        if not isinstance(file.get(name, getlink=True), h5py.HardLink):  # a link may lead into other files
+            found = ", ".join(sorted(file)) or "nothing"
+            raise BadInput(f"{path}: expected a data set {name!r} in it, found {found}; copy the file again")
+        dataset = file[name]
+        if not isinstance(dataset, h5py.Dataset) or dataset.is_virtual or dataset.external:
+            raise BadInput(f"{path}: expected {name!r} to be a data set of its own, found something else")
+        _check_array(dataset.dtype, dataset.shape or (), shape, f"{path}: expected {name!r}")
+    except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
+        raise _damaged(path, error) from error
+    return dataset
+
+
+def _read_dataset(
+    file: h5py.File, name: str, shape: tuple[int | None, ...] | None, path: Path
+) -> NDArray[np.float64]:
+    dataset = _dataset(file, name, shape, path)
+    try:
+        return np.asarray(dataset[()], np.float64)
+    except (OSError, RuntimeError, ValueError, MemoryError) as error:
+        raise _damaged(path, error) from error
+
+
+def _damaged(path: Path, error: Exception) -> BadInput:
+    return BadInput(f"{path}: damaged ({one_line(error)}); copy the file again")
+
+
+class MaskFile:
+    """The masks of an HDF5 file, read one frame at a time through one handle. Threads may share it."""
+
+    def __init__(self, path: Path):
+        """Reads the header. Raises `BadInput` when the file is damaged or its `masks` are not [N, H, W] numbers."""
+        self.path = path
+        self._lock = threading.Lock()
+        self._file: h5py.File | None = None
+        with _hdf5(path) as file:
+            self.shape: tuple[int, int, int] = tuple(_dataset(file, "masks", (None, None, None), path).shape)
+        if 0 in self.shape:
+            raise BadInput(f"{path}: expected 'masks' of shape [N, H, W], found none ({list(self.shape)})")
+
+    def __reduce__(self) -> tuple:
+        return type(self), (self.path,)  # a handle stays with its process
+
+    def frame(self, number: int) -> NDArray[np.bool_]:
+        """[H, W], True = person. Raises `BadInput` when the frame's data are damaged."""
+        with self._lock:
+            if self._file is None:
+                self._file = _hdf5(self.path)
+            try:
+                mask = np.asarray(_dataset(self._file, "masks", (None, *self.shape[1:]), self.path)[number])
+            except (OSError, RuntimeError, ValueError, MemoryError) as error:
+                raise BadInput(
+                    f"{self.path}: mask {number} is damaged ({one_line(error)}); copy the file again"
+                ) from error
+        return mask > 0.5 if mask.dtype.kind == "f" else mask != 0
+
+
+class Video:
+    """The frames of a video by number, counted by decoding, since seeking is inexact with many codecs.
+
+    Going forward decodes what lies between; going back starts over. The last `KEPT_PICTURES` frames that were asked
+    for are kept. Threads may share it.
+    """
+
+    def __init__(self, path: Path):
+        """Reads the header. Raises `BadInput` when it is missing, damaged, or names no frames."""
+        self.path = path
+        self._lock = threading.Lock()
+        self._kept: OrderedDict[int, NDArray[np.uint8]] = OrderedDict()
+        self._next = 0  # the frame that the stream decodes next
+        self._stream = self._opened()
+        import cv2
+
+        self.n_frames = int(self._stream.get(cv2.CAP_PROP_FRAME_COUNT))  # by the header
+        width, height = (int(self._stream.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        self.size = (height, width)  # px
+        self.fps = float(self._stream.get(cv2.CAP_PROP_FPS))
+        if self.n_frames < 1:
+            raise BadInput(f"{path}: its header names no frames; expected a complete video, copy the file again")
+
+    def __reduce__(self) -> tuple:
+        return type(self), (self.path,)  # a decoder stays with its process
+
+    def frame(self, number: int) -> NDArray[np.uint8]:
+        """[H, W, 3] RGB. Raises `BadInput` when the video ends before this frame."""
+        import cv2
+
+        with self._lock:
+            if number in self._kept:
+                self._kept.move_to_end(number)
+                return self._kept[number].copy()
+            if number < self._next:
+                self._stream.release()
+                self._stream, self._next = self._opened(), 0
+            while self._next < number:
+                self._step(self._stream.grab(), number)
+            ok, picture = self._stream.read()
+            self._step(ok, number)
+            image = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+            self._kept[number] = image
+            while len(self._kept) > KEPT_PICTURES:
+                self._kept.popitem(last=False)
+            return image.copy()
+
+    def _step(self, decoded: bool, wanted: int) -> None:
+        if decoded:
+            self._next += 1
+            return
+        ended, self._next = self._next, 1 << 62  # the stream is spent: start over at the next call
+        raise BadInput(
+            f"{self.path}: ends after {ended} frames, but frame {wanted} was asked for and its header promises "
+            f"{self.n_frames}; copy the file again"
+        )
+
+    def _opened(self) -> Any:
+        import cv2
+
+        if not self.path.is_file():
+            raise BadInput(f"{self.path}: no such file; expected the subject's video")
+        try:
+            stream = cv2.VideoCapture(str(self.path.absolute()), cv2.CAP_FFMPEG)
+            opened = stream.isOpened()
+        except cv2.error as error:
+            raise BadInput(f"{self.path}: not a readable video ({one_line(error)}); copy the file again") from error
+        if not opened:
+            raise BadInput(f"{self.path}: cut short, or not a video that OpenCV reads; copy the file again")
+        return stream
+
+
+# ----------------------------------------------------------------------------------------------- check
+
+
+def check(root: Path, samples: int = 3, body: Body | None = None) -> dict[str, Any]:
+    """What this copy is and what it lacks, for `ihbench data check`.
+
+    Decodes `samples` frames a subject, which decodes the video up to the last of them. Raises `BadInput` when the
+    root is not of this layout at all; what is wrong with a subject is listed in its "problems". `vertices_in_mask` is
+    the share of body vertices that project into the silhouette (grown by 1 % of the image's width); it needs a body,
+    which stand-ins have. "alignment" says which poses were taken and the shares that decided. `consensus_betas` is
+    the largest difference of consensus.pkl's betas from the poses' own.
+    """
+    return checked(PeopleSnapshotRaw(root), body, lambda capture, found: _inspect(capture, samples, found))
+
+
+def checked(dataset: Any, body: Body | None, inspect: Callable[[Any, dict[str, Any]], None]) -> dict[str, Any]:
+    """The report of `check` for every subject of a data set; `inspect` adds what a layout has to say to one."""
+    subjects = []
+    for name in dataset.subjects():
+        problems: list[str] = []
+        found: dict[str, Any] = {"subject": name, "problems": problems}
+        subjects.append(found)
+        try:
+            capture = dataset.open(name, body)
+            found |= {
+                "standin": capture.standin,
+                "body": capture.body,
+                "gender": capture.gender,
+                "variant": capture.variant,
+                "cameras": len(capture.camera_ids),
+                "frames": capture.n_frames,
+            }
+            inspect(capture, found)
+        except BadInput as error:
+            problems.append(str(error))
+    return {
+        "dataset": SnapshotFolder.dataset,
+        "layout": dataset.layout,
+        "root": str(dataset.root),
+        "standin": next((subject["standin"] for subject in subjects if subject.get("standin")), ""),
+        "subjects": subjects,
+        "ok": not any(subject["problems"] for subject in subjects),
+    }
+
+
+def sample_frames(capture: Any, frames: Sequence[int], samples: int, found: dict[str, Any]) -> None:
+    """Decode a few of the frames and project the body into their silhouettes; adds the result to `found`."""
+    overlaps: list[Overlap] = []
+    sizes, decoded = set(), 0
+    problems = found["problems"]
+    for frame in sorted({frames[i] for i in np.linspace(0, len(frames) - 1, samples).astype(int)} if frames else ()):
+        try:
+            height, width, _ = capture.image(0, frame).shape
+            sizes.add((width, height))
+            silhouette = capture.silhouette(0, frame)
+            decoded += 1
+            if capture.has_body:
+                points = capture.camera(0).project(capture.model.pose(capture.body_pose(frame)))
+                overlaps.append(overlap_of(points, silhouette))
+        except BadInput as error:
+            if str(error) not in problems:
+                problems.append(str(error))
+    found["sampled_images"] = decoded
+    found["image_size"] = sorted([list(size) for size in sizes])
+    if overlaps:
+        found["vertices_in_mask"] = round(float(np.mean([overlap.inside for overlap in overlaps])), 4)
+        problems += overlap_problems(overlaps)
+
+
+def spoiled_rows(*arrays: NDArray) -> list[int]:
+    """The rows that hold NaN or infinity in any of the arrays [N, …]."""
+    bad = np.zeros(len(arrays[0]), bool)
+    for array in arrays:
+        bad |= ~np.isfinite(array.reshape(len(array), -1)).all(1)
+    return np.flatnonzero(bad).tolist()
+
+
+def spelled_rows(path: Path, rows: list[int]) -> str:
+    """The problem "NaN in these rows", with the first few named."""
+    named = ", ".join(str(row) for row in rows[:5]) + (", …" if len(rows) > 5 else "")
+    return f"{path}: NaN or infinity in {len(rows)} row{'s' if len(rows) > 1 else ''} ({named}); leave these out"
+
+
+def _inspect(capture: PeopleSnapshotCapture, samples: int, found: dict[str, Any]) -> None:
+    problems = found["problems"]
+    counts = {"video": capture.video.n_frames, "masks": capture.n_masks, "poses": capture.n_poses}
+    found["files"] = dict(counts)
+    found["missing"] = {name: max(0, capture.n_masks - counts[name]) for name in ("video", "poses")}
+    if counts["video"] < capture.n_masks:
+        problems.append(
+            f"{capture.video.path}: {counts['video']} frames, but there are {capture.n_masks} masks; "
+            f"expected a frame for each mask, copy the video again"
+        )
+    if counts["poses"] < capture.n_masks:
+        problems.append(f"{capture.folder / POSES_FILE}: {counts['poses']} poses for {capture.n_masks} masks")
+    shares = capture.alignment_shares
+    found["alignment"] = {
+        "chosen": capture.alignment,
+        **{name: round(shares[name], 4) if shares else None for name in ("first", "last")},
+    }
+    pose, trans, betas = capture._poses
+    if rows := spoiled_rows(pose, trans):
+        problems.append(spelled_rows(capture.folder / POSES_FILE, rows))
+    if (capture.folder / CONSENSUS_FILE).is_file():
+        found["files"]["consensus"] = 1
+        try:
+            personal, _ = read_consensus(capture.folder / CONSENSUS_FILE)
+            found["consensus_betas"] = round(float(np.abs(personal - betas).max()), 4)
+        except BadInput as error:
+            problems.append(str(error))
+    if (capture.folder / KEYPOINTS_FILE).is_file():
+        try:
+            found["files"]["keypoints"] = len(read_keypoints(capture.folder / KEYPOINTS_FILE))
+        except BadInput as error:
+            problems.append(str(error))
+    sample_frames(capture, range(capture.n_frames), samples, found)
+
+
+# ----------------------------------------------------------------------------------------------- write
+
+
+def write_camera(folder: Path, camera: Camera) -> None:
+    """camera.pkl; `read_camera` undoes it to 1e-12. Raises `ValueError` for a skewed camera, which has no place."""
+    import cv2
+
+    K = camera.K_opencv
+    if K[0, 1]:
+        raise ValueError("camera.pkl: expected a camera without skew")
+    write_pickle(
+        folder / CAMERA_FILE,
+        {
+            "camera_t": camera.t.copy(),
+            "camera_rt": cv2.Rodrigues(camera.R)[0].reshape(3),
+            "camera_f": np.array([K[0, 0], K[1, 1]]),
+            "camera_c": K[:2, 2].copy(),
+            "camera_k": np.zeros(5) if camera.distortion is None else camera.distortion.copy(),
+            "width": camera.width,
+            "height": camera.height,
+        },
+    )
+
+
+def write_masks(folder: Path, masks: Iterable[NDArray], shape: tuple[int, int, int]) -> None:
+    """masks.hdf5 from N masks [H, W], non-zero = person; `shape` is (N, H, W). Lossless.
+
+    Raises `ValueError` for another number or size of masks.
+    """
+    with _new_hdf5(folder / MASKS_FILE) as file:
+        stored = file.create_dataset("masks", shape, np.int8, compression="lzf", chunks=(1, *shape[1:]))
+        n = 0
+        for n, mask in enumerate(masks, 1):
+            if n > shape[0] or mask.shape != shape[1:]:
+                raise ValueError(f"masks: expected {shape[0]} of {shape[1:]}, got {mask.shape} as number {n}")
+            stored[n - 1] = mask != 0
+        if n != shape[0]:
+            raise ValueError(f"masks: expected {shape[0]}, got {n}")
+
+
+def write_poses(folder: Path, poses: Sequence[BodyPose]) -> None:
+    """reconstructed_poses.hdf5, float32 (1e-6 rad and m). Raises `ValueError` when the betas differ: it holds one."""
+    pose, trans, betas = stacked(poses)
+    with _new_hdf5(folder / POSES_FILE) as file:
+        for name, value in (("pose", pose), ("trans", trans), ("betas", betas)):
+            file.create_dataset(name, data=value, compression="lzf")
+
+
+def stacked(poses: Sequence[BodyPose]) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """(pose [N, 72], trans [N, 3], betas [B]), float32. Raises `ValueError` for none, or other betas in one."""
+    if not poses:
+        raise ValueError("poses: expected at least one")
+    if any(not np.array_equal(pose.betas, poses[0].betas) for pose in poses):
+        raise ValueError("poses: expected the same betas in every frame, the file holds them once")
+    pose = np.stack([pose.pose.reshape(72) for pose in poses]).astype(np.float32)
+    trans = np.stack([pose.transl for pose in poses]).astype(np.float32)
+    return pose, trans, poses[0].betas.astype(np.float32)
+
+
+def write_consensus(folder: Path, betas: NDArray, v_personal: NDArray) -> None:
+    """consensus.pkl: betas [10] and the offsets of the template's vertices [V, 3] m. Lossless."""
+    write_pickle(
+        folder / CONSENSUS_FILE,
+        {"betas": np.asarray(betas, np.float64), "v_personal": np.asarray(v_personal, np.float64)},
+    )
+
+
+def write_keypoints(folder: Path, keypoints: NDArray) -> None:
+    """keypoints.hdf5 from [N, 18, 3] (x px, y px, confidence), float32."""
+    if keypoints.ndim != 3 or keypoints.shape[1:] != (N_KEYPOINTS, 3):
+        raise ValueError(f"keypoints: expected shape [N, {N_KEYPOINTS}, 3], got {keypoints.shape}")
+    with _new_hdf5(folder / KEYPOINTS_FILE) as file:
+        file.create_dataset("keypoints", data=keypoints.reshape(len(keypoints), -1).astype(np.float32))
+
+
+def write_video(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float = 30.0) -> None:
+    """An MPEG-4 (mp4v) video of frames [H, W, 3] RGB. Lossy: 32 dB PSNR or more on smooth pictures.
+
+    Raises `ValueError` for no frames, odd or changing sizes, which the codec cannot hold, and `BadInput` when the
+    disk does not take it.
+    """
+    import cv2
+
+    with tempfile.TemporaryDirectory() as scratch:
+        temporary = Path(scratch) / "video.mp4"
+        writer, shape, n = None, (0, 0, 3), 0
+        try:
+            for frame in frames:
+                if writer is None:
+                    shape = frame.shape
+                    if frame.ndim != 3 or shape[2] != 3 or shape[0] % 2 or shape[1] % 2 or frame.dtype != np.uint8:
+                        raise ValueError(f"video: expected uint8 RGB frames of even size, got {frame.dtype} {shape}")
+                    codec = cv2.VideoWriter.fourcc(*"mp4v")
+                    writer = cv2.VideoWriter(str(temporary), cv2.CAP_FFMPEG, codec, fps, shape[1::-1])
+                    if not writer.isOpened():
+                        raise BadInput(f"{path}: OpenCV cannot write MPEG-4 video here; reinstall opencv-python")
+                if frame.shape != shape:
+                    raise ValueError(f"video: expected frames of one size, got {shape} and {frame.shape}")
+                writer.write(cv2.cvtColor(np.ascontiguousarray(frame), cv2.COLOR_RGB2BGR))
+                n += 1
+        finally:
+            if writer is not None:
+                writer.release()
+        if not n:
+            raise ValueError("video: expected at least one frame")
+        if not temporary.is_file() or (written := Video(temporary)).n_frames != n or written.size != shape[:2]:
+            raise BadInput(f"{path}: the video came out incomplete; make room on the disk and try again")
+        atomic.write_bytes(path, temporary.read_bytes(), durable=False)
+
+
+class _new_hdf5:
+    """An HDF5 file in memory that takes its name on disk only when it is complete."""
+
+    def __init__(self, path: Path):
+        import h5py
+
+        self._path = path
+        self._file = h5py.File(path.name, "w", driver="core", backing_store=False)
+
+    def __enter__(self) -> h5py.File:
+        return self._file
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        with self._file as file:
+            file.flush()
+            if kind is None:
+                atomic.write_bytes(self._path, file.id.get_file_image(), durable=False)

@@ -1,0 +1,764 @@
+"""A documented folder for people's own videos: read, check and write. `plain_scene.md` beside this file describes it.
+
+images/000000.png              one camera; images/<camera>/000000.png with several; .png, .jpg or .jpeg
+masks/…                        the same paths as .png, non-zero = person
+cameras.json                   K, R, t (metres, world -> camera, OpenCV axes), size, distortion of every camera
+poses.npz                      SMPL poses, shapes and translations, one row a frame
+body.npz                       optional: the body they belong to, as `ihbench.body.write_body` writes it
+scene.json                     optional: {"name": …, "about": …}
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import math
+import re
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench import atomic
+from ihbench.body import Body, from_zju_root, load_body, write_body, zju_root
+from ihbench.body.skinning_numpy import axis_angle_to_matrix
+from ihbench.camera import Camera
+from ihbench.datasets.capture_folder import CaptureFolder
+from ihbench.datasets.overlap import share_inside
+from ihbench.datasets.pictures import decoded, encoded
+from ihbench.datasets.standin_mark import STANDIN_FILE
+from ihbench.errors import BadInput
+from ihbench.registry import nearest
+from ihbench.scene import BodyPose
+
+Array = NDArray[np.float64]
+
+CAMERAS_FILE, POSES_FILE, BODY_FILE, SCENE_FILE = "cameras.json", "poses.npz", "body.npz", "scene.json"
+IMAGE_ENDINGS = (".png", ".jpg", ".jpeg")
+CAMERA_KEYS = ("K", "R", "t", "width", "height", "distortion", "pixel_center")
+POSE_KEYS = ("frames", "pose", "betas", "transl", "root")
+ROOTS = ("smpl", "zju")
+LARGEST_ENTRY = 2**28  # bytes of one array in poses.npz: 460 000 frames
+JPEG_QUALITY = 95
+FARTHEST, NEAREST = 100, 0.05  # m, plausible median depth of a body
+SMPL_PELVIS = (0.0, -0.24, 0.03)  # m, about, in SMPL's rest pose; only `check` uses it
+CHECK_SIZE = 256  # px, longest side at which `check` compares silhouettes
+
+
+class PlainScene:
+    """A scene folder, or a folder that holds several. A subject is named by scene.json, else by its folder."""
+
+    def __init__(self, root: Path):
+        """Raises `BadInput` when there is no such folder, no scene in it, or two scenes have one name."""
+        self.root = Path(root).expanduser()
+        if not self.root.is_dir():
+            raise BadInput(f"{self.root}: no such folder; give a scene folder (with {CAMERAS_FILE} in it)")
+        if _is_scene(self.root):
+            folders = [self.root.absolute()]  # "." has a name, too
+        else:
+            folders = sorted(folder for folder in self.root.iterdir() if folder.is_dir() and _is_scene(folder))
+        if not folders:
+            below = next(self.root.glob(f"*/*/{CAMERAS_FILE}"), None)
+            where = f"; there is one in {below.parent.parent}, give that folder" if below else ""
+            raise BadInput(
+                f"{self.root}: neither {CAMERAS_FILE} nor {POSES_FILE} in it or in a folder of it; "
+                f"expected a scene folder or a folder of scene folders{where}"
+            )
+        self._folders: dict[str, Path] = {}
+        for folder in folders:
+            name = read_about(folder)["name"]
+            if name in self._folders:
+                raise BadInput(
+                    f"{folder}: named {name!r}, as {self._folders[name].name} is; rename one in {SCENE_FILE}"
+                )
+            self._folders[name] = folder
+
+    @staticmethod
+    def check(root: Path) -> dict[str, Any]:
+        """What these scenes hold and lack; see `check` below."""
+        return check(root)
+
+    def subjects(self) -> list[str]:
+        """Names, sorted."""
+        return sorted(self._folders)
+
+    def open(self, subject: str, body: Body | None = None) -> PlainCapture:
+        """One scene. Reads cameras.json and poses.npz, no image.
+
+        `body` is the SMPL model the poses belong to; not needed with a body.npz. Raises `BadInput` for an unknown
+        subject, a damaged one, and for another `body` than body.npz holds.
+        """
+        if subject not in self._folders:
+            raise BadInput(f"{self.root}: no subject {subject!r}: {nearest(subject, self.subjects())}")
+        return PlainCapture(self._folders[subject], subject, body)
+
+
+class PlainCapture(CaptureFolder):
+    """One scene, read lazily; see `ihbench.scene.Capture`. Frames are the rows of poses.npz, by frame number."""
+
+    dataset = "custom"
+    variant = "plain"
+
+    def __init__(self, folder: Path, name: str, body: Body | None = None):
+        has_own_body = (folder / BODY_FILE).is_file()
+        root = folder if (folder / STANDIN_FILE).is_file() else folder.parent
+        super().__init__(folder, name, None if has_own_body else body, root)
+        self.about: str = read_about(folder)["about"]
+        self._cameras = read_cameras(folder / CAMERAS_FILE)
+        self._poses = read_poses(folder / POSES_FILE)
+        self.camera_ids = tuple(self._cameras)
+        self.n_frames = len(self._poses.frames)
+        self._listings: dict[tuple[str, int], dict[int, list[Path]]] = {}
+        if has_own_body:
+            self.body = "own"
+            if body is not None and body.content_sha() != self.model.content_sha():
+                raise BadInput(
+                    f"{folder / BODY_FILE}: the scene has its own body, but another ({body.name}) was given; "
+                    f"give no body file, or remove {BODY_FILE}"
+                )
+
+    @cached_property
+    def model(self) -> Body:
+        """body.npz where there is one, else as in other captures. Raises `BadInput`."""
+        if self.body != "own":
+            return super().model
+        path = self.folder / BODY_FILE
+        try:
+            return replace(load_body(path), name="own")
+        except (zlib.error, NotImplementedError, RuntimeError) as error:
+            raise BadInput(f"{path}: damaged ({_one_line(error)}); write the file again") from error
+
+    def camera(self, camera: int) -> Camera:
+        self.check_index(camera, 0)
+        return self._cameras[self.camera_ids[camera]]
+
+    def body_pose(self, frame: int) -> BodyPose:
+        """The frame's SMPL parameters in the standard root convention."""
+        self.check_index(0, frame)
+        stored = self._poses.row(frame)
+        if self._poses.root == "smpl":
+            return stored
+        pose = stored.pose.copy()
+        pose[0] = 0
+        model = self.model
+        try:
+            return from_zju_root(pose, stored.betas, stored.pose[0], stored.transl, model)
+        except BadInput as error:
+            raise BadInput(f"{self.folder / POSES_FILE}: {error}") from error
+
+    def image(self, camera: int, frame: int) -> NDArray[np.uint8]:
+        """[H, W, 3] RGB, as stored; an alpha channel is dropped."""
+        return self._read_picture("images", camera, frame, "RGB")
+
+    def silhouette(self, camera: int, frame: int, source: str = "mask") -> NDArray[np.bool_]:
+        """[H, W] non-zero in masks/. `source` is "mask", there is no other."""
+        if source != "mask":
+            raise BadInput(f"silhouette source {source!r}: {nearest(source, ['mask'])}")
+        mask = self._read_picture("masks", camera, frame, None)
+        return (mask if mask.ndim == 2 else mask.max(2)) != 0
+
+    def content_digest(self, camera: int, frame: int, source: str = "mask") -> bytes:
+        """Hash of the bytes of one view's image and mask file; a missing file counts as empty."""
+        number, digest = self.number(frame), hashlib.sha256()
+        for kind in ("images", "masks") if source == "mask" else ("images",):
+            for path in self.files(kind, camera).get(number, []):
+                digest.update(path.read_bytes() if path.is_file() else b"")
+            digest.update(kind.encode())
+        return digest.digest()
+
+    def number(self, frame: int) -> int:
+        """The number that the frame's files carry."""
+        self.check_index(0, frame)
+        return int(self._poses.frames[frame])
+
+    def picture_folder(self, kind: str, camera: int) -> Path:
+        """Where a camera's files of a kind ("images", "masks") lie: a lone camera needs no folder of its own."""
+        folder = self.folder / kind
+        own = folder / self.camera_ids[camera]
+        return own if len(self.camera_ids) > 1 or own.is_dir() else folder
+
+    def files(self, kind: str, camera: int) -> dict[int, list[Path]]:
+        """Frame number -> files of that number (one, unless something is wrong), listed once."""
+        self.check_index(camera, 0)
+        key = kind, camera
+        if key not in self._listings:
+            listing: dict[int, list[Path]] = {}
+            endings = IMAGE_ENDINGS if kind == "images" else (".png",)
+            for path in _pictures(self.picture_folder(kind, camera), endings):
+                if _is_number(path.stem):
+                    listing.setdefault(int(path.stem), []).append(path)
+            self._listings[key] = listing
+        return self._listings[key]
+
+    def _read_picture(self, kind: str, camera: int, frame: int, mode: str | None) -> NDArray[np.uint8]:
+        number = self.number(frame)
+        paths = self.files(kind, camera).get(number, [])
+        if len(paths) > 1:
+            names = " and ".join(path.name for path in paths)
+            raise BadInput(f"{paths[0].parent}: {names} are both frame {number}; keep one of them")
+        if not paths:
+            path = self.picture_folder(kind, camera) / f"{number:06d}.png"
+            or_else = " or .jpg" if kind == "images" else ""
+            raise BadInput(f"{path}{or_else}: no such file; {POSES_FILE} has frame {number}{self.standin_hint}")
+        try:
+            picture = decoded(paths[0], mode)
+        except ValueError as error:  # a 16-bit picture, say
+            raise BadInput(f"{paths[0]}: cannot be made 8-bit RGB ({_one_line(error)}); save it as such") from error
+        view = self.camera(camera)
+        if picture.shape[:2] != (view.height, view.width):
+            raise BadInput(
+                f"{paths[0]}: {picture.shape[1]}×{picture.shape[0]} px, but {CAMERAS_FILE} says "
+                f"{view.width}×{view.height} px for camera {self.camera_ids[camera]!r}; make them agree"
+            )
+        return picture
+
+
+def _is_scene(folder: Path) -> bool:
+    return (folder / CAMERAS_FILE).is_file() or (folder / POSES_FILE).is_file()
+
+
+def _pictures(folder: Path, endings: Sequence[str]) -> list[Path]:
+    if not folder.is_dir():
+        return []
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in endings and path.name[0] != ".")
+
+
+def _is_number(stem: str) -> bool:
+    return re.fullmatch(r"[0-9]{1,18}", stem) is not None
+
+
+def _one_line(error: object) -> str:
+    return " ".join(str(error).split())[:120]
+
+
+def read_about(folder: Path) -> dict[str, str]:
+    """{"name", "about"} of scene.json; the folder's name and "" where it says nothing. Raises `BadInput`."""
+    path = folder / SCENE_FILE
+    content = atomic.read_json(path) if path.is_file() else {}
+    if not isinstance(content, dict) or not all(isinstance(content.get(key, ""), str) for key in ("name", "about")):
+        raise BadInput(f'{path}: expected {{"name": text, "about": text}}, found other contents')
+    name = content.get("name", folder.absolute().name)
+    if not re.fullmatch(r"[^/\\\x00-\x1f.][^/\\\x00-\x1f]{0,79}", name):
+        raise BadInput(f"{path}: name {name!r}: expected 1 to 80 characters, no slash, no dot in front; rename it")
+    return {"name": name, "about": content.get("about", "")}
+
+
+# --------------------------------------------------------------------------------------------- cameras
+
+
+def read_cameras(path: Path) -> dict[str, Camera]:
+    """The views by camera id, in the file's order. Raises `BadInput` naming the camera and key that is wrong."""
+    if not path.is_file():
+        raise BadInput(f"{path}: no such file; expected the K, R, t, width and height of every camera in it")
+    content = atomic.read_json(path)
+    cameras = content.get("cameras") if isinstance(content, dict) else None
+    if not isinstance(cameras, dict) or not cameras:
+        raise BadInput(f'{path}: expected {{"cameras": {{"<id>": {{"K": …, "R": …, "t": …}}}}}}, found no camera')
+    for key in content:
+        if key != "cameras":
+            raise BadInput(f"{path}: unknown key {key!r} beside 'cameras'; remove it or move it into each camera")
+    return {name: _camera(name, entry, path) for name, entry in cameras.items()}
+
+
+def _camera(name: str, entry: Any, path: Path) -> Camera:
+    if not re.fullmatch(r"[^/\\\x00-\x1f.][^/\\\x00-\x1f]*", name):
+        raise BadInput(f"{path}: camera id {name!r}: expected a folder's name, no slash, no dot in front")
+    where = f"{path}: camera {name!r}"
+    if not isinstance(entry, dict):
+        raise BadInput(f"{where}: expected a dictionary with {', '.join(CAMERA_KEYS[:5])}")
+    for key in entry:
+        if key not in CAMERA_KEYS:
+            raise BadInput(f"{where}: unknown key {key!r}: {nearest(key, list(CAMERA_KEYS))}")
+    width, height = (_pixels(entry, key, where) for key in ("width", "height"))
+    K, R, t = (_numbers(entry, key, shape, where) for key, shape in (("K", (3, 3)), ("R", (3, 3)), ("t", (3,))))
+    if K[0, 0] <= 0 or K[1, 1] <= 0 or K[1, 0] != 0 or not np.array_equal(K[2], [0, 0, 1]):
+        raise BadInput(f"{where}: K: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0; check the signs")
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3:
+        raise BadInput(f"{where}: R: expected a rotation matrix (R Rᵀ = 1), found another; leave scale and t out")
+    if np.linalg.det(R) < 0:
+        raise BadInput(f"{where}: R: expected a rotation, found a reflection (a left-handed world); flip one axis")
+    distortion = None
+    if entry.get("distortion") is not None:
+        distortion = _numbers(entry, "distortion", (5,), where)
+    center = entry.get("pixel_center", 0.0)
+    if isinstance(center, bool) or center not in (0, 0.5):
+        raise BadInput(f"{where}: pixel_center: expected 0.0 or 0.5, the centre of the first pixel; found {center!r}")
+    K[:2, 2] += 0.5 - center
+    return Camera(K, R, t, width, height, distortion if distortion is not None and distortion.any() else None)
+
+
+def _pixels(entry: dict[str, Any], key: str, where: str) -> int:
+    value = entry.get(key)
+    if type(value) is not int or not 0 < value <= 2**16:
+        raise BadInput(f"{where}: {key}: expected a whole number of pixels, found {_shown(value)}")
+    return value
+
+
+def _numbers(entry: dict[str, Any], key: str, shape: tuple[int, ...], where: str) -> Array:
+    wanted = f"{where}: {key}: expected finite numbers of shape {list(shape)}"
+    if key not in entry:
+        raise BadInput(f"{wanted}, found no such key")
+    try:
+        value = np.array(entry[key], np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise BadInput(f"{wanted}, found {_shown(entry[key])}") from None
+    if value.shape != shape or not np.isfinite(value).all():
+        raise BadInput(f"{wanted}, found {list(value.shape) if value.shape != shape else 'NaN or infinity'}")
+    return value
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 40 else f"{text[:40]}…"
+
+
+# ----------------------------------------------------------------------------------------------- poses
+
+
+@dataclass(frozen=True)
+class Poses:
+    """poses.npz, checked and sorted by frame number."""
+
+    frames: NDArray[np.int64]  # [N] numbers of the image files
+    pose: Array  # [N, 24, 3] rad
+    betas: Array  # [N, B]
+    transl: Array  # [N, 3] m
+    root: str  # "smpl", or "zju": pose[:, 0] and transl are ZJU-MoCap's Rh and Th
+
+    def row(self, frame: int) -> BodyPose:
+        """One frame as stored, whatever the root."""
+        return BodyPose(self.pose[frame], self.betas[frame], self.transl[frame])
+
+
+def read_poses(path: Path) -> Poses:
+    """The SMPL parameters of every frame. Raises `BadInput` naming the array that is not as expected."""
+    arrays = _read_npz(path)
+    for key in ("pose", "betas", "transl"):
+        if key not in arrays:
+            raise BadInput(f"{path}: no array {key!r}; expected pose [N, 72], betas [B] and transl [N, 3]")
+    pose, betas, transl = (_floats(arrays, key, path) for key in ("pose", "betas", "transl"))
+    n = len(pose) if pose.ndim else 0
+    if n == 0 or pose.shape not in ((n, 72), (n, 24, 3)):
+        raise BadInput(f"{path}: pose: expected shape [N, 72] or [N, 24, 3], found {list(pose.shape)}")
+    if transl.shape != (n, 3):
+        raise BadInput(f"{path}: transl: expected shape [{n}, 3], a row for each pose, found {list(transl.shape)}")
+    if betas.ndim == 1:
+        betas = betas[None]
+    if betas.ndim != 2 or len(betas) not in (1, n) or betas.shape[1] == 0:
+        raise BadInput(f"{path}: betas: expected shape [B] or [{n}, B], found {list(arrays['betas'].shape)}")
+    largest = np.abs(pose).max()
+    if largest > 20:
+        raise BadInput(f"{path}: pose: expected radians, found {largest:.3g}; multiply by π/180 if it is in degrees")
+    root = arrays.get("root", np.array("smpl"))
+    if root.shape != () or root.dtype.kind != "U" or str(root) not in ROOTS:
+        raise BadInput(f"{path}: root: expected one text, {' or '.join(ROOTS)}, found {_shown(root.tolist())}")
+    frames = _frame_numbers(arrays.get("frames"), n, path)
+    order = np.argsort(frames)
+    betas = np.broadcast_to(betas, (n, betas.shape[1]))
+    return Poses(frames[order], pose.reshape(n, 24, 3)[order], betas[order], transl[order], str(root))
+
+
+def _frame_numbers(frames: NDArray | None, n: int, path: Path) -> NDArray[np.int64]:
+    if frames is None:
+        return np.arange(n)
+    if frames.shape != (n,) or frames.dtype.kind not in "iu":
+        raise BadInput(
+            f"{path}: frames: expected {n} whole numbers, one a pose, found {frames.dtype} {list(frames.shape)}"
+        )
+    if int(frames.min()) < 0 or int(frames.max()) >= 10**18:
+        raise BadInput(f"{path}: frames: expected numbers of image files, found {frames.min()} to {frames.max()}")
+    numbers, counts = np.unique(frames, return_counts=True)
+    if (counts > 1).any():
+        raise BadInput(f"{path}: frames: number {numbers[counts > 1][0]} appears twice; give each frame one pose")
+    return frames.astype(np.int64)
+
+
+def _floats(arrays: dict[str, NDArray], key: str, path: Path) -> Array:
+    value = arrays[key]
+    if value.dtype.kind not in "iuf":
+        raise BadInput(f"{path}: {key}: expected numbers, found {value.dtype}")
+    bad = np.argwhere(~np.isfinite(value))
+    if len(bad):
+        row = f" in row {bad[0][0]}" if value.ndim else ""
+        raise BadInput(f"{path}: {key}: NaN or infinity{row}; expected finite numbers, leave such frames out")
+    return value.astype(np.float64)
+
+
+def _read_npz(path: Path) -> dict[str, NDArray]:
+    if not path.is_file():
+        raise BadInput(f"{path}: no such file; expected the poses of every frame in it")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            largest = max((entry.file_size for entry in archive.infolist()), default=0)
+        if largest > LARGEST_ENTRY:
+            raise BadInput(f"{path}: an array of {largest} bytes; expected poses, at most {LARGEST_ENTRY} bytes each")
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {key: archive[key] for key in archive.files}
+    except (
+        *(ValueError, OSError, EOFError, KeyError, MemoryError, zipfile.BadZipFile, zlib.error),
+        *(NotImplementedError, RuntimeError, SyntaxError, TypeError),  # what damaged archives and headers raise
+    ) as error:
+        raise BadInput(
+            f"{path}: cannot be read as a .npz of plain arrays ({_one_line(error)}); write the file again"
+        ) from None
+    for key, value in arrays.items():
+        if key not in POSE_KEYS:
+            raise BadInput(f"{path}: unknown array {key!r}: {nearest(key, list(POSE_KEYS))}")
+        if not isinstance(value, np.ndarray):
+            raise BadInput(f"{path}: {key}: not a numpy array; write the file again with numpy.savez")
+    return arrays
+
+
+# ----------------------------------------------------------------------------------------------- check
+
+
+@dataclass
+class _Overlap:
+    """How the body's silhouette and one mask lie on each other, the mask as stored and turned about."""
+
+    vertices_in_mask: float
+    mask_on_body: float
+    iou: dict[str, float]  # by how the mask was changed: "" for as stored
+    full: bool  # the mask covers everything
+
+
+CHANGES = {
+    "": lambda mask: mask,
+    "inverted": lambda mask: ~mask,
+    "mirrored": lambda mask: mask[:, ::-1],
+    "upside down": lambda mask: mask[::-1],
+    "rotated": lambda mask: mask[::-1, ::-1],
+}
+ADVICE = {
+    "inverted": "the masks look inverted; expected non-zero for the person, 0 for the rest",
+    "mirrored": "pictures and geometry are mirrored left to right; flip the pictures or the geometry's x axis",
+    "upside down": "pictures and geometry are upside down to each other; expected OpenCV axes, y down",
+    "rotated": "pictures and geometry are turned by 180° to each other; expected OpenCV axes, x right, y down",
+}
+CLEARLY = 0.2  # how much more overlap tells that a change is the right one
+
+
+def check(root: Path, samples: int = 3, body: Body | None = None) -> dict[str, Any]:
+    """What these scenes hold and lack, for `ihbench data check`.
+
+    Lists folders, projects the body of `samples` frames into every camera, and compares it with the masks of up to
+    four cameras. Without `body` (the SMPL model of the poses) and body.npz, the bench's own body in mean shape
+    stands for SMPL ("body_used"): good for units, axes and flips. Raises `BadInput` when the root is no scene folder;
+    what is wrong with a scene is in its "problems". `vertices_in_mask` is the share of body vertices that project
+    into the silhouette (grown by 1 %), `mask_on_body` the share of the silhouette on the (grown) body; an occluded
+    person has less of the former, wrong cameras, units or poses less of both. A person who stands upright in the
+    middle of a picture has no mirror image to tell apart.
+    """
+    dataset = PlainScene(root)
+    subjects = [_check_subject(dataset, name, samples, body) for name in dataset.subjects()]
+    return {
+        "dataset": PlainCapture.dataset,
+        "layout": PlainCapture.variant,
+        "root": str(dataset.root),
+        "standin": next((subject["standin"] for subject in subjects if subject.get("standin")), ""),
+        "subjects": subjects,
+        "ok": not any(subject["problems"] for subject in subjects),
+    }
+
+
+def _check_subject(dataset: PlainScene, name: str, samples: int, body: Body | None) -> dict[str, Any]:
+    problems: list[str] = []
+    found: dict[str, Any] = {"subject": name, "problems": problems}
+    try:
+        capture = dataset.open(name)
+        if body is not None and capture.body == body.name:
+            capture = dataset.open(name, body)
+    except BadInput as error:
+        problems.append(str(error))
+        return found
+    found |= {
+        "standin": capture.standin,
+        "body": capture.body,
+        "variant": capture.variant,
+        "cameras": len(capture.camera_ids),
+        "frames": capture.n_frames,
+    }
+    _check_files(capture, found, problems)
+    try:
+        posed = _posed(capture, samples, found)
+    except BadInput as error:
+        problems.append(str(error))
+        return found
+    aimed = _check_geometry(capture, posed, problems)
+    _check_pictures(capture, posed, aimed, found, problems)
+    return found
+
+
+def _check_files(capture: PlainCapture, found: dict[str, Any], problems: list[str]) -> None:
+    posed = {capture.number(frame) for frame in range(capture.n_frames)}
+    counts = {"image": 0, "mask": 0}
+    missing = {"image": 0, "mask": 0, "pose": 0}
+    for camera, name in enumerate(capture.camera_ids):
+        images, masks = (capture.files(kind, camera) for kind in ("images", "masks"))
+        here = "" if len(capture.camera_ids) == 1 else f" of camera {name!r}"
+        counts["image"] += len(images)
+        counts["mask"] += len(masks)
+        lacks = {
+            "pose": (images.keys() - posed, f"images{here} have no pose in {POSES_FILE}"),
+            "image": (posed - images.keys(), f"poses have no image{here}"),
+            "mask": (images.keys() & posed - masks.keys(), f"images{here} have no mask"),
+        }
+        for what, (numbers, text) in lacks.items():
+            missing[what] += len(numbers)
+            if numbers and not (capture.standin and what == "image"):
+                problems.append(f"{len(numbers)} {text}; the first is frame {min(numbers)}")
+        for listing in (images, masks):
+            for number, paths in listing.items():
+                if len(paths) > 1:
+                    names = " and ".join(path.name for path in paths)
+                    problems.append(f"{paths[0].parent}: {names} are both frame {number}; keep one of them")
+        for kind in ("images", "masks"):
+            odd = [
+                path
+                for path in _pictures(capture.picture_folder(kind, camera), IMAGE_ENDINGS)
+                if not _is_number(path.stem) or (kind == "masks" and path.suffix.lower() != ".png")
+            ]
+            if odd:
+                ending = "png" if kind == "masks" else "png or .jpg"
+                problems.append(f"{odd[0]}: {len(odd)} such names are ignored; expected <frame number>.{ending}")
+    found["files"], found["missing"] = counts, missing
+    for kind in ("images", "masks"):
+        folder = capture.folder / kind
+        if not folder.is_dir():
+            problems.append(f"{folder}: no such folder")
+        elif len(capture.camera_ids) > 1:
+            strays = sorted(f.name for f in folder.iterdir() if f.is_dir() and f.name not in capture.camera_ids)
+            problems += [f"{folder / stray}: {CAMERAS_FILE} has no camera of this name" for stray in strays]
+
+
+def _posed(capture: PlainCapture, samples: int, found: dict[str, Any]) -> dict[int, tuple[Array, NDArray[np.int32]]]:
+    """Frame -> (vertices [V, 3] m, faces) of a few frames, of SMPL or of the bench's body in its place."""
+    frames = sorted(set(np.linspace(0, capture.n_frames - 1, samples).astype(int).tolist()))
+    with_pictures = set.intersection(*(set(capture.files(k, 0)) for k in ("images", "masks")))
+    complete = [frame for frame in range(capture.n_frames) if capture.number(frame) in with_pictures]
+    if complete:
+        frames = sorted({complete[i] for i in np.linspace(0, len(complete) - 1, samples).astype(int)})
+    try:
+        model = capture.model
+    except BadInput:
+        if capture.body != "smpl":
+            raise
+        found["body_used"] = "procedural, in SMPL's place"
+        model = load_body()
+        return {frame: (model.pose(_like_smpl(capture, frame, model)), model.faces) for frame in frames}
+    found["body_used"] = model.name
+    return {frame: (model.pose(capture.body_pose(frame)), model.faces) for frame in frames}
+
+
+def _like_smpl(capture: PlainCapture, frame: int, model: Body) -> BodyPose:
+    """The pose that puts the bench's mean body where SMPL's mean body is."""
+    stored = capture._poses.row(frame)
+    pelvis = np.array(SMPL_PELVIS)
+    if capture._poses.root == "zju":
+        pelvis = axis_angle_to_matrix(stored.pose[0]) @ pelvis
+    return BodyPose(stored.pose, np.zeros(1), stored.transl + pelvis - model.joints[0])
+
+
+def _check_geometry(
+    capture: PlainCapture, posed: dict[int, tuple[Array, NDArray[np.int32]]], problems: list[str]
+) -> list[int]:
+    """Report cameras with implausible units or without the body in view; return the others."""
+    far, near, blind, good = [], [], [], []
+    for camera in range(len(capture.camera_ids)):
+        view = capture.camera(camera)
+        points = np.concatenate([view.project(vertices) for vertices, _ in posed.values()])
+        depth = float(np.median(points[:, 2]))
+        if abs(depth) > FARTHEST:
+            far.append((camera, depth))
+        elif abs(depth) < NEAREST:
+            near.append((camera, depth))
+        elif share_inside(points, np.ones((view.height, view.width), bool)) == 0:
+            blind.append((camera, depth))
+        else:
+            good.append(camera)
+    for group, text in (
+        (far, f"more than {FARTHEST} m: t or transl look like millimetres; expected metres, divide by 1000"),
+        (
+            near,
+            f"less than {NEAREST} m: t or transl are not in metres, or one of them is missing",
+        ),
+    ):
+        if group:
+            problems.append(f"{_named(capture, group)}: the body is {group[0][1]:.3g} m in front of it, {text}")
+    if blind:
+        depth = blind[0][1]
+        where = (
+            f"{-depth:.3g} m behind it: expected R, t from world to camera, with OpenCV axes (z forward)"
+            if depth < 0
+            else f"{depth:.3g} m in front of it, out of the picture: check K, R, t and the frames of the poses"
+        )
+        problems.append(f"{_named(capture, blind)}: sees no body in the sampled frames; it is {where}")
+    return good
+
+
+def _named(capture: PlainCapture, group: list[tuple[int, float]]) -> str:
+    names = ", ".join(capture.camera_ids[camera] for camera, _ in group[:5])
+    return f"camera{'s' * (len(group) > 1)} {names}{'…' * (len(group) > 5)}"
+
+
+def _check_pictures(
+    capture: PlainCapture,
+    posed: dict[int, tuple[Array, NDArray[np.int32]]],
+    aimed: list[int],
+    found: dict[str, Any],
+    problems: list[str],
+) -> None:
+    """Decode a few images and compare their masks with the body's silhouette."""
+    overlaps: list[_Overlap] = []
+    sizes, n_images = set(), 0
+    n_cameras = len(capture.camera_ids)
+    for camera in sorted({int(i) for i in np.linspace(0, n_cameras - 1, min(4, n_cameras))}):
+        for frame, (vertices, faces) in posed.items():
+            number = capture.number(frame)
+            if number not in capture.files("images", camera) or number not in capture.files("masks", camera):
+                continue
+            try:
+                height, width, _ = capture.image(camera, frame).shape
+                mask = capture.silhouette(camera, frame)
+            except BadInput as error:
+                problems.append(str(error))
+                continue
+            n_images += 1
+            sizes.add((width, height))
+            if not mask.any():
+                problems.append(f"{capture.files('masks', camera)[number][0]}: shows no person, all is 0")
+            elif camera in aimed:
+                overlaps.append(_overlap(capture.camera(camera), vertices, faces, mask))
+    found["sampled_images"] = n_images
+    found["image_size"] = sorted([list(size) for size in sizes])
+    if not n_images:
+        problems.append("no image with its mask and pose found")
+    if not overlaps:
+        return
+    inside = found["vertices_in_mask"] = round(float(np.mean([o.vertices_in_mask for o in overlaps])), 4)
+    covered = found["mask_on_body"] = round(float(np.mean([o.mask_on_body for o in overlaps])), 4)
+    if all(overlap.full for overlap in overlaps):
+        problems.append("the masks cover whole pictures; expected 0 where the person is not (alpha is ignored)")
+        return
+    iou = {change: float(np.mean([o.iou[change] for o in overlaps])) for change in CHANGES}
+    best = max(iou, key=lambda change: iou[change])
+    exact = found["body_used"] != "procedural, in SMPL's place"
+    if best and iou[best] > iou[""] + CLEARLY:
+        problems.append(f"{ADVICE[best]} (overlap {iou['']:.0%} as stored, {iou[best]:.0%} {best})")
+    elif inside < (0.95 if exact else 0.7) and covered < (0.7 if exact else 0.5):
+        problems.append(
+            f"only {inside:.0%} of the body's vertices project into the silhouettes and only {covered:.0%} of the "
+            f"silhouettes lie on the body; expected over 95 %, or silhouettes on the body where it is occluded"
+        )
+
+
+def _overlap(view: Camera, vertices: Array, faces: NDArray[np.int32], mask: NDArray[np.bool_]) -> _Overlap:
+    from scipy.ndimage import binary_dilation
+
+    from ihbench.render.zbuffer import rasterize
+
+    shrink = min(1.0, CHECK_SIZE / max(view.width, view.height))
+    width, height = max(1, math.ceil(view.width * shrink)), max(1, math.ceil(view.height * shrink))
+    rows = ((np.arange(height) + 0.5) * view.height / height).astype(int)
+    columns = ((np.arange(width) + 0.5) * view.width / width).astype(int)
+    mask = mask[rows][:, columns]
+    points = view.scaled(width, height).project(vertices)
+    person = rasterize(points, faces, height, width).mask
+    grow = max(1, width // 100)
+    iou = {}
+    for name, change in CHANGES.items():
+        changed = change(mask)
+        iou[name] = float((changed & person).sum()) / max(1, int((changed | person).sum()))
+    return _Overlap(
+        vertices_in_mask=share_inside(points, np.asarray(binary_dilation(mask, iterations=grow), bool)),
+        mask_on_body=float(np.asarray(binary_dilation(person, iterations=grow))[mask].mean()) if mask.any() else 0.0,
+        iou=iou,
+        full=bool(mask.mean() > 0.98),
+    )
+
+
+# ----------------------------------------------------------------------------------------------- write
+
+
+def write_cameras(folder: Path, cameras: Mapping[str, Camera], pixel_center: float = 0.0) -> None:
+    """cameras.json; `read_cameras` undoes it. `pixel_center` is what the file's K calls it."""
+    if pixel_center not in (0.0, 0.5):
+        raise ValueError(f"pixel_center {pixel_center}: expected 0.0 or 0.5")
+    entries = {}
+    for name, camera in cameras.items():
+        K = camera.K_opencv if pixel_center == 0 else camera.K
+        entries[name] = {"K": K, "R": camera.R, "t": camera.t, "width": camera.width, "height": camera.height}
+        entries[name]["pixel_center"] = pixel_center
+        if camera.distortion is not None:
+            entries[name]["distortion"] = camera.distortion
+    atomic.write_json(Path(folder) / CAMERAS_FILE, {"cameras": entries})
+
+
+def write_poses(
+    folder: Path,
+    body_poses: Sequence[BodyPose],
+    frames: Sequence[int] | None = None,  # numbers of the image files, default 0, 1, …
+    root: str = "smpl",
+    body: Body | None = None,
+) -> None:
+    """poses.npz; `PlainCapture.body_pose` undoes it. `root="zju"` stores Rh and Th, which need the `body`."""
+    if root not in ROOTS or (root == "zju" and body is None):
+        raise ValueError(f"root {root!r}: expected 'smpl', or 'zju' with the body")
+    pose = np.stack([p.pose for p in body_poses])
+    transl = np.stack([p.transl for p in body_poses])
+    if root == "zju":
+        assert body is not None
+        transl = np.stack([zju_root(p, body)[1] for p in body_poses])
+    arrays: dict[str, Any] = {
+        "frames": np.arange(len(pose)) if frames is None else np.asarray(frames, np.int64),
+        "pose": pose,
+        "betas": np.stack([p.betas for p in body_poses]),
+        "transl": transl,
+        "root": np.array(root),
+    }
+    if len(arrays["frames"]) != len(pose):
+        raise ValueError(f"poses: expected {len(pose)} frame numbers, got {len(arrays['frames'])}")
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    atomic.write_bytes(Path(folder) / POSES_FILE, buffer.getvalue())
+
+
+def write_frame(
+    folder: Path,
+    number: int,
+    image: NDArray[np.uint8] | None = None,  # [H, W, 3] RGB
+    mask: NDArray | None = None,  # [H, W] non-zero = person
+    camera_id: str | None = None,  # None: the only camera, without a folder of its own
+    ending: str = "png",
+) -> None:
+    """The picture files of one camera at one frame: PNG, or JPEG with `ending="jpg"`. None is not written."""
+    place = Path(folder)
+    subfolder = camera_id or "."
+    if image is not None:
+        as_png = ending == "png"
+        data = encoded(image, "PNG", compress_level=3) if as_png else encoded(image, "JPEG", quality=JPEG_QUALITY)
+        atomic.write_bytes(place / "images" / subfolder / f"{number:06d}.{ending}", data, durable=False)
+    if mask is not None:
+        labels = np.where(np.asarray(mask) != 0, 255, 0).astype(np.uint8)
+        path = place / "masks" / subfolder / f"{number:06d}.png"
+        atomic.write_bytes(path, encoded(labels, "PNG", compress_level=3), durable=False)
+
+
+def write_body_file(folder: Path, body: Body) -> None:
+    """body.npz, the body that the poses belong to; `PlainCapture.model` reads it."""
+    with tempfile.TemporaryDirectory() as spare:
+        path = Path(spare) / BODY_FILE
+        write_body(path, body)
+        atomic.write_bytes(Path(folder) / BODY_FILE, path.read_bytes())
+
+
+def write_about(folder: Path, name: str, about: str = "") -> None:
+    """scene.json; `read_about` undoes it."""
+    atomic.write_json(Path(folder) / SCENE_FILE, {"name": name, "about": about})

@@ -1,0 +1,48 @@
+"""The names of stand-in people, and the mark on the folder that holds a cast."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ihbench import atomic
+from ihbench.body import Body
+from ihbench.datasets.standin_mark import STANDIN_FILE
+from ihbench.errors import BadInput
+
+NAME_PREFIX = "standin-"
+
+
+def member_number(subject: str) -> int:
+    number = subject.removeprefix(NAME_PREFIX)
+    if not subject.startswith(NAME_PREFIX) or not number.isdecimal() or int(number) < 1 or number != str(int(number)):
+        raise BadInput(f"stand-in subject {subject!r}: expected {NAME_PREFIX}1, {NAME_PREFIX}2, …")
+    return int(number)
+
+
+def claim(root: Path, version: int, seed: int, body: Body) -> None:
+    """Mark the folder as this cast's, unless it belongs to something else."""
+    mark = {
+        "generator": "ihbench",
+        "version": version,
+        "seed": seed,
+        "body": body.name,
+        "body_sha": body.content_sha(),
+    }
+    path = root / STANDIN_FILE
+    if path.is_file():
+        found = atomic.read_json(path)
+        if found != mark:
+            raise BadInput(
+                f"{root}: holds another stand-in ({_differences(found, mark)}); choose another folder or remove it"
+            )
+        return
+    if root.exists() and (not root.is_dir() or any(root.iterdir())):
+        raise BadInput(f"{root}: not an empty folder and not a stand-in; choose another folder")
+    atomic.write_json(path, mark)
+
+
+def _differences(found: object, asked: dict[str, object]) -> str:
+    if not isinstance(found, dict):
+        return "no readable mark"
+    differing = [key for key in asked if found.get(key) != asked[key]]
+    return ", ".join(f"{key} {found.get(key)!r}, asked for {asked[key]!r}" for key in differing) or "other keys"

@@ -1,0 +1,128 @@
+"""Stand-ins in the layout of OcMotion's `_w2a` sequences: a person walks and reaches behind furniture.
+
+One hundred frames from one of six calibrated cameras; the masks are of visible pixels, decided by depth. Beside each
+sequence's files lies `truth/`, which no loader reads: the complete silhouettes, and the images without the furniture
+before the person (everything behind them stays).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from ihbench import atomic
+from ihbench.body import load_body
+from ihbench.camera import Camera, look_at
+from ihbench.datasets import ocmotion_w2a
+from ihbench.datasets.pictures import encoded
+from ihbench.datasets.standin import motion
+from ihbench.datasets.standin.cast import NAME_PREFIX, claim, member_number
+from ihbench.datasets.standin.furniture import furnish, furniture_view
+from ihbench.datasets.standin.photograph import photograph
+from ihbench.datasets.standin.studio import empty_studio
+from ihbench.datasets.standin.subject import Subject
+from ihbench.errors import BadInput
+from ihbench.progress import Progress
+
+VERSION = 1  # of the generator; a change that moves a pixel raises it
+N_FRAMES = 100
+N_CAMERAS = 6  # of the rig; the images are of the first
+WIDTH, HEIGHT = 960, 720  # px
+REACH = 0.75  # m to either side that the person walks
+
+
+class OcMotionStandIn:
+    """Makes sequences of procedural people. A file depends on (VERSION, seed, subject, frame) only."""
+
+    version = VERSION
+    n_frames = N_FRAMES
+    n_cameras = 1
+
+    @staticmethod
+    def subjects(count: int = 6) -> list[str]:
+        """The names of the first `count` people of a cast."""
+        return [f"{NAME_PREFIX}{number}" for number in range(1, count + 1)]
+
+    @staticmethod
+    def ensure(
+        root: Path,
+        seed: int,
+        subjects: list[str],
+        wanted: Mapping[int, Iterable[int]],  # a sequence is whole whatever is wanted of it
+        progress: Progress | None = None,
+    ) -> Path:
+        """Write what is not yet there of these sequences below `root`, and return `root`.
+
+        Raises `BadInput` for an unknown subject and when `root` holds something else.
+        """
+        root = Path(root).expanduser()
+        if seed < 0:
+            raise BadInput(f"stand-in seed {seed}: expected 0 or more")
+        numbers = [member_number(subject) for subject in subjects]
+        body = load_body()
+        claim(root, VERSION, seed, body)
+        progress = progress or Progress.silent()
+        for name, number in zip(subjects, numbers, strict=True):
+            _ensure_sequence(root / name, name, Subject(seed, number, body), progress)
+        return root
+
+
+def room_cameras(rng: np.random.Generator) -> list[Camera]:
+    """Six cameras without lens distortion around the room, world z up; the first looks across the furniture."""
+    cameras = []
+    for k in range(N_CAMERAS):
+        azimuth = -np.pi / 2 + 2 * np.pi * k / N_CAMERAS + np.deg2rad(rng.uniform(-4, 4))
+        radius = rng.uniform(3.3, 3.6)
+        eye = np.array([radius * np.cos(azimuth), radius * np.sin(azimuth), rng.uniform(1.25, 1.45)])
+        R, t = look_at(eye, np.array([0.0, 0.0, rng.uniform(0.88, 0.95)]), up=np.array([0.0, 0.0, 1.0]))
+        focal = rng.uniform(0.83, 0.87) * WIDTH
+        centre = np.array([WIDTH, HEIGHT]) / 2 + rng.uniform(-8, 8, 2)
+        K = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]])
+        cameras.append(Camera(K, R, t, WIDTH, HEIGHT))
+    return cameras
+
+
+def _ensure_sequence(folder: Path, name: str, subject: Subject, progress: Progress) -> None:
+    names = [f"{frame:05d}" for frame in range(N_FRAMES)]
+    missing = [k for k in range(N_FRAMES) if not (folder / "truth" / "masks" / f"{names[k]}.png").is_file()]
+    show = motion.stroll(subject.rng("stroll"), N_FRAMES, REACH)
+    poses = motion.body_poses(show, subject.betas, subject.body)
+    cameras = room_cameras(subject.rng("room"))
+    if not (folder / "metadata.json").is_file():
+        ocmotion_w2a.write_sequence_metadata(folder, names, cameras[0], poses)
+        ocmotion_w2a.write_mesh_infos(folder, names, poses, subject.body)
+        ocmotion_w2a.write_all_cameras(folder, names, cameras)
+    if not missing:
+        return
+    room = empty_studio(cameras[0], subject.studio_seed)
+    furniture = furniture_view(furnish(subject.rng("furniture")), subject.lighting, cameras[0], room)
+
+    def write(k: int) -> None:
+        surface = subject.body.pose(poses[k], offsets=subject.offsets)
+        shot = photograph(
+            surface,
+            subject.body,
+            subject.texture,
+            subject.labels,
+            subject.lighting,
+            cameras[0],
+            furniture.image,
+        )
+        before = furniture.depth < shot.depth
+        image = np.where(before[..., None], furniture.image, shot.image)
+        ocmotion_w2a.write_frame(folder, names[k], image, shot.mask & ~before)
+        whole = encoded(shot.image, "JPEG", quality=95)
+        atomic.write_bytes(folder / "truth" / "images" / f"{names[k]}.jpg", whole, durable=False)
+        silhouette = encoded(shot.mask.astype(np.uint8) * 255, "PNG")
+        atomic.write_bytes(folder / "truth" / "masks" / f"{names[k]}.png", silhouette, durable=False)  # is last
+
+    with progress.task(f"filming {name}", total=len(missing)) as task:
+        write(missing[0])  # computes what the threads share before they start
+        task.advance()
+        with ThreadPoolExecutor((os.cpu_count() or 1) + 1) as pool:
+            for _ in pool.map(write, missing[1:]):
+                task.advance()

@@ -1,0 +1,132 @@
+"""Stand-ins in PeopleSnapshot's raw layout: one and a half turns in an A-pose before a fixed camera.
+
+The camera is the world, as in the real data. Frames 0 to 159 are the first turn, 160 to 239 the half turn after it.
+Beside each subject's files lies `truth/`, which no loader reads: the texture and the surface that were photographed.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench import atomic
+from ihbench.body import load_body
+from ihbench.body.skinning_numpy import axis_angle_to_matrix
+from ihbench.camera import Camera, look_at
+from ihbench.datasets import people_snapshot
+from ihbench.datasets.pictures import encoded
+from ihbench.datasets.standin import motion
+from ihbench.datasets.standin.cast import NAME_PREFIX, claim, member_number
+from ihbench.datasets.standin.photograph import Photograph, photograph
+from ihbench.datasets.standin.studio import empty_studio
+from ihbench.datasets.standin.subject import Subject
+from ihbench.errors import BadInput
+from ihbench.progress import Progress
+from ihbench.scene import BodyPose
+
+VERSION = 1  # of the generator; a change that moves a pixel raises it
+TURN_FRAMES, TEST_FRAMES = 160, 80
+N_FRAMES = TURN_FRAMES + TEST_FRAMES
+TURNS = 1.5
+SIZE = 1080  # px
+
+
+class PeopleSnapshotStandIn:
+    """Makes captures of procedural people. A file depends on (VERSION, seed, subject) only."""
+
+    version = VERSION
+    n_frames = N_FRAMES
+    n_cameras = 1
+
+    @staticmethod
+    def subjects(count: int = 4) -> list[str]:
+        """The names of the first `count` people of a cast."""
+        return [f"{NAME_PREFIX}{number}" for number in range(1, count + 1)]
+
+    @staticmethod
+    def ensure(
+        root: Path,
+        seed: int,
+        subjects: list[str],
+        wanted: Mapping[int, Iterable[int]],  # the video is whole whatever is wanted of it
+        progress: Progress | None = None,
+    ) -> Path:
+        """Write the subjects that are not yet there below `root`, and return `root`.
+
+        Raises `BadInput` for an unknown subject and when `root` holds something else.
+        """
+        root = Path(root).expanduser()
+        if seed < 0:
+            raise BadInput(f"stand-in seed {seed}: expected 0 or more")
+        numbers = [member_number(subject) for subject in subjects]
+        body = load_body()
+        claim(root, VERSION, seed, body)
+        progress = progress or Progress.silent()
+        for name, number in zip(subjects, numbers, strict=True):
+            if not (root / name / "reconstructed_poses.hdf5").is_file():  # is written last
+                _write_subject(root / name, name, Subject(seed, number, body), progress)
+        return root
+
+
+def studio_camera(rng: np.random.Generator) -> Camera:
+    """A camera about 2.9 m before the person at hip height, in the studio's world (z up)."""
+    eye = np.array([rng.uniform(-0.05, 0.05), -rng.uniform(2.85, 3.0), rng.uniform(0.85, 1.05)])
+    R, t = look_at(eye, np.array([0.0, 0.0, rng.uniform(0.9, 0.95)]), up=np.array([0.0, 0.0, 1.0]))
+    focal = rng.uniform(1280, 1340)
+    centre = SIZE / 2 + rng.uniform(-6, 6, 2)
+    K = np.array([[focal, 0, centre[0]], [0, focal * rng.uniform(0.998, 1.002), centre[1]], [0, 0, 1]])
+    k1 = rng.uniform(-0.12, -0.05)
+    lens = np.array([k1, -0.4 * k1, *rng.uniform(-5e-4, 5e-4, 2), 0.0])
+    return Camera(K, R, t, SIZE, SIZE, lens)
+
+
+def in_camera_space(body_pose: BodyPose, camera: Camera, pelvis: NDArray[np.float64]) -> BodyPose:
+    """The pose in a world whose axes and origin are the camera's; pelvis [3] m is the shaped body's joint 0."""
+    from scipy.spatial.transform import Rotation
+
+    pose = body_pose.pose.copy()
+    pose[0] = Rotation.from_matrix(camera.R @ axis_angle_to_matrix(body_pose.pose[0])).as_rotvec()
+    transl = camera.R @ (pelvis + body_pose.transl) + camera.t - pelvis
+    return BodyPose(pose, body_pose.betas, transl)
+
+
+def _write_subject(folder: Path, name: str, subject: Subject, progress: Progress) -> None:
+    show = motion.turntable(subject.rng("turntable"), N_FRAMES, TURNS)
+    poses = motion.body_poses(show, subject.betas, subject.body)
+    camera = studio_camera(subject.rng("camera"))
+    background = empty_studio(camera, subject.studio_seed)
+    masks: NDArray[np.bool_] = np.zeros((N_FRAMES, SIZE, SIZE), bool)
+
+    def shoot(frame: int) -> Photograph:
+        surface = subject.body.pose(poses[frame], offsets=subject.offsets)
+        return photograph(
+            surface, subject.body, subject.texture, subject.labels, subject.lighting, camera, background
+        )
+
+    def frames(pool: ThreadPoolExecutor) -> Iterator[NDArray[np.uint8]]:
+        with progress.task(f"filming {name}", total=N_FRAMES) as task:
+            step = 8  # photographs in memory
+            for start in range(0, N_FRAMES, step):
+                for frame, shot in zip(
+                    range(start, N_FRAMES), pool.map(shoot, range(start, min(start + step, N_FRAMES))), strict=False
+                ):
+                    masks[frame] = shot.mask
+                    yield shot.image
+                    task.advance()
+
+    shoot(0)  # computes what the threads share before they start
+    with ThreadPoolExecutor((os.cpu_count() or 1) + 1) as pool:
+        people_snapshot.write_video(folder / f"{folder.name}.mp4", frames(pool))
+    own = Camera(camera.K, np.eye(3), np.zeros(3), SIZE, SIZE, camera.distortion)
+    people_snapshot.write_camera(folder, own)
+    people_snapshot.write_masks(folder, masks, masks.shape)
+    people_snapshot.write_consensus(folder, subject.betas, subject.offsets)
+    texture = np.rint(np.clip(subject.texture, 0, 1) * 255).astype(np.uint8)
+    atomic.write_bytes(folder / "truth" / "texture.png", encoded(texture, "PNG"))
+    pelvis = subject.body.shaped(subject.betas)[1][0]
+    people_snapshot.write_poses(folder, [in_camera_space(pose, camera, pelvis) for pose in poses])

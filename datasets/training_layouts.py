@@ -1,0 +1,89 @@
+"""Writers of occluded training sets in the layouts that released training code reads. Behind `ihbench prepare`.
+
+Images are PNG everywhere, also where the original release has JPEG: a second compression would be a second method.
+Cameras have no lens distortion left. Views are numbered from 0.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ihbench import atomic
+from ihbench.datasets import gaussianavatar, humannerf, instantavatar, ocmotion_w2a, zju_mocap, zju_refine
+from ihbench.datasets.pictures import encoded
+from ihbench.prepare import Handout
+
+
+def zju(handout: Handout) -> Path:
+    """The original release's layout, one camera: CoreView_NAME."""
+    folder = handout.folder / f"{zju_mocap.FOLDER_PREFIX}{handout.name}"
+    paths = [f"Camera_B1/{number:06d}.png" for number in range(handout.n_views)]
+    zju_mocap.write_annots(folder, handout.cameras[:1], [[path] for path in paths])
+    for view in handout.views():
+        zju_mocap.write_params(folder, view.number, view.body_pose, handout.body)
+        zju_mocap.write_vertices(folder, view.number, handout.body.pose(view.body_pose))
+        _png(folder / paths[view.number], view.image)
+        zju_mocap.write_frame(folder, paths[view.number], mask=view.visible * np.uint8(255))
+    return folder
+
+
+def zju_refined(handout: Handout) -> Path:
+    """The refine repack's layout, one camera: my_NAME."""
+    folder = handout.folder / f"{zju_refine.PREFIX}{handout.name}"
+    paths = [f"images/00/{number:06d}.png" for number in range(handout.n_views)]
+    zju_mocap.write_annots(folder, handout.cameras[:1], [[path] for path in paths])
+    for view in handout.views():
+        zju_mocap.write_params(folder, view.number, view.body_pose, handout.body, zju_refine.PARAMS)
+        zju_mocap.write_vertices(folder, view.number, handout.body.pose(view.body_pose), zju_refine.PARAMS)
+        _png(folder / paths[view.number], view.image)
+        mask = folder / "mask" / "00" / f"{view.number:06d}.png"
+        _png(mask, view.visible * np.uint8(255))
+    return folder
+
+
+def human_nerf(handout: Handout) -> Path:
+    """HumanNeRF's and OccNeRF's layout, one camera."""
+    folder = handout.folder / handout.name
+    names = [humannerf.view_name(number) for number in range(handout.n_views)]
+    pairs = zip(names, zip(handout.cameras, handout.body_poses, strict=True), strict=True)
+    humannerf.write_pickles(folder, dict(pairs), handout.body)
+    for view in handout.views():
+        humannerf.write_view(folder, names[view.number], view.image, view.visible)
+    return folder
+
+
+def instant_avatar(handout: Handout) -> Path:
+    """InstantAvatar's layout."""
+    folder = handout.folder / handout.name
+    instantavatar.write_camera(folder, handout.cameras[0])
+    instantavatar.write_poses(folder, handout.body_poses)
+    for view in handout.views():
+        instantavatar.write_frame(folder, view.number, view.image, view.visible)
+    return folder
+
+
+def gaussian_avatar(handout: Handout) -> Path:
+    """GaussianAvatar's layout, its training part."""
+    folder = handout.folder / handout.name
+    gaussianavatar.write_camera(folder, "train", handout.cameras[0])
+    gaussianavatar.write_poses(folder, "train", handout.body_poses)
+    for view in handout.views():
+        gaussianavatar.write_frame(folder, "train", view.number, view.image, view.visible)
+    return folder
+
+
+def ocmotion(handout: Handout) -> Path:
+    """The layout of OcMotion's `_w2a` sequences, as OccFusion reads it."""
+    folder = handout.folder / handout.name
+    names = [f"{number:05d}" for number in range(handout.n_views)]
+    ocmotion_w2a.write_sequence_metadata(folder, names, handout.cameras[0], handout.body_poses)
+    ocmotion_w2a.write_mesh_infos(folder, names, handout.body_poses, handout.body)
+    for view in handout.views():
+        ocmotion_w2a.write_frame(folder, names[view.number], view.image, view.visible)
+    return folder
+
+
+def _png(path: Path, picture: np.ndarray) -> None:
+    atomic.write_bytes(path, encoded(picture, "PNG", compress_level=3), durable=False)

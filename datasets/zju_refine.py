@@ -1,0 +1,77 @@
+"""ZJU-MoCap-refine, the repack with better cameras and poses that Instant-NVR, GauHuman and OccFusion read.
+
+    my_377/annots.npy                  cameras and image paths, as in the original release
+    my_377/images/00/000000.jpg        1024×1024, lens distortion in
+    my_377/mask/00/000000.png          non-zero = person; there is no mask_cihp
+    my_377/smpl_params/0.npy           poses, shapes, Rh, Th, in ZJU-MoCap's root convention
+    my_377/smpl_vertices/0.npy         [V, 3] m, world
+
+Source: tiangexiang/OccFusion scene/dataset_readers.py:666-763. Numbers on it are not those on the original release:
+the record names the variant.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench import atomic
+from ihbench.body import Body
+from ihbench.datasets import zju_mocap
+from ihbench.datasets.pictures import encoded
+from ihbench.datasets.zju_mocap import ZjuCapture, ZjuMocap
+from ihbench.errors import BadInput
+
+PREFIX = "my_"
+PARAMS = "smpl_params"
+
+
+class ZjuRefine(ZjuMocap):
+    """A folder that holds `my_*` folders, or one of those folders itself."""
+
+    prefix = PREFIX
+
+    @staticmethod
+    def check(root: Path, body: Body | None = None) -> dict[str, Any]:
+        return zju_mocap.check(ZjuRefine(root), "refine")
+
+    def _capture(self, folder: Path, body: Body | None) -> ZjuCapture:
+        return ZjuRefineCapture(folder, body)
+
+
+class ZjuRefineCapture(ZjuCapture):
+    """One subject of the repack."""
+
+    layout, prefix = "refine", PREFIX
+    fits = (PARAMS,)
+    mask_kinds = ("mask",)
+
+    def image_path(self, camera: int, frame: int) -> Path:
+        return self.folder / "images" / self._below_images(camera, frame)
+
+    def mask_path(self, camera: int, frame: int, kind: str = "mask") -> Path:
+        if kind != "mask":
+            raise BadInput(
+                f"{self.folder}: the refine repack has no {kind} masks; use a protocol whose silhouette is mask"
+            )
+        return self.folder / kind / self._below_images(camera, frame).with_suffix(".png")
+
+    def _below_images(self, camera: int, frame: int) -> PurePosixPath:
+        self.check_index(camera, frame)
+        path = PurePosixPath(self._annots.image_paths[frame][camera])
+        return path.relative_to("images") if path.parts[:1] == ("images",) else path
+
+
+def standard_image_paths(n_cameras: int, n_frames: int) -> list[list[str]]:
+    """Per frame the paths that annots.npy lists: images/00/000000.jpg for camera 0, frame 0."""
+    return [[f"images/{camera:02d}/{frame:06d}.jpg" for camera in range(n_cameras)] for frame in range(n_frames)]
+
+
+def write_frame(folder: Path, image_path: str, image: NDArray[np.uint8], mask: NDArray) -> None:
+    """The picture files of one camera at one frame; `image_path` as annots.npy lists it, with images/ in front."""
+    zju_mocap.write_frame(folder, image_path, image)
+    path = folder / "mask" / PurePosixPath(image_path).relative_to("images").with_suffix(".png")
+    atomic.write_bytes(path, encoded(mask.astype(np.uint8) * 255, "PNG", compress_level=3), durable=False)

@@ -1,0 +1,69 @@
+"""`ihbench prepare --protocol P --out DIR`: hand out the occluded training set for other people's code."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from ihbench.commands.parse import options
+from ihbench.commands.scene_choice import ProtocolChanges
+from ihbench.errors import BadInput
+
+OWN_LAYOUT = {
+    "zju_mocap": "zju",
+    "people_snapshot": "instantavatar",
+    "ocmotion": "ocmotion-w2a",
+    "custom": "humannerf",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class PrepareOptions(ProtocolChanges):
+    protocol: str
+    """A registered protocol (`ihbench list protocols`), or the path of a protocol file of your own (.toml)."""
+    out: Path
+    """Folder to write into; each scene gets a folder of its own."""
+    layout: str | None = None
+    """zju, zju-refine, humannerf, instantavatar, gaussianavatar or ocmotion-w2a; by default the data set's own."""
+    scene: tuple[str, ...] = ()
+    """Scenes; none means all that the protocol names."""
+    profile: str = "paper"
+    """paper or quick: the size of the images, and which test views."""
+    data: Path | None = None
+    """Your copy of the data set; without it (and without IHBENCH_DATA) a stand-in."""
+    body: Path | None = None
+    """SMPL model file for real data (or IHBENCH_BODY)."""
+    force: bool = False
+    """Replace what an earlier call has written."""
+    json: bool = False
+    """Print one JSON object on stdout and nothing else there."""
+
+
+def main(argv: list[str]) -> int:
+    chosen = options(PrepareOptions, argv, "prepare", "Write the occluded training set, and nothing that it hides.")
+    from ihbench import registry
+    from ihbench.data_source import locate
+    from ihbench.prepare import prepare
+    from ihbench.progress import Progress
+    from ihbench.protocol import load_protocol
+    from ihbench.views import open_scene
+
+    protocols = chosen.apply(load_protocol(chosen.protocol, chosen.profile))
+    if len(protocols) > 1:
+        raise BadInput("--occlusion.fraction: one severity at a time, each into a folder of its own")
+    layout = chosen.layout or OWN_LAYOUT.get(protocols[0].dataset, "humannerf")
+    registry.entry_point("training layout", layout)
+    source, progress = locate(protocols[0], chosen.data, chosen.scene), Progress()
+    written = {}
+    for scene in source.scenes:
+        capture, body = source.open(scene, chosen.body, progress)
+        opened = open_scene(capture, protocols[0])
+        written[scene] = str(prepare(opened, body, chosen.out, layout, progress, chosen.force))
+    if chosen.json:
+        print(json.dumps({"layout": layout, "protocol": protocols[0].name, "scenes": written}))
+    else:
+        for scene, folder in written.items():
+            print(f"{scene}: {folder} ({layout}); the test views to draw are in {folder}/test_views.json")
+        print(f"score what your code draws: ihbench score --protocol {chosen.protocol} --predictions DIR")
+    return 0

@@ -1,0 +1,48 @@
+"""One data set in several on-disk layouts: the one that a folder has is found by trying."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Any
+
+from ihbench.errors import BadInput
+from ihbench.scene import Dataset
+
+if TYPE_CHECKING:
+    from ihbench.body import Body
+
+
+@dataclass(frozen=True)
+class LayoutChoice:
+    """A registered data set: called with a folder it opens the layout that is there; see `ihbench.scene.Dataset`."""
+
+    name: str
+    layouts: tuple[str, ...]  # "module:class" of each, in the order in which they are tried
+
+    def __call__(self, root: Path) -> Dataset:
+        return self._find(root)(root)
+
+    def check(self, root: Path, body: Body | None = None) -> dict[str, Any]:
+        """What a folder holds and lacks. `body` is the user's SMPL model, with which poses are held against masks.
+
+        Raises `BadInput` when it has none of the layouts.
+        """
+        return self._find(root).check(root, body)
+
+    def _find(self, root: Path) -> type[Dataset]:
+        if not Path(root).expanduser().is_dir():
+            raise BadInput(f"{root}: no such folder")
+        complaints = []
+        for name in self.layouts:
+            layout = resolve_name(name)
+            try:
+                layout(root)
+            except BadInput as error:
+                complaints.append(str(error).removeprefix(f"{root}: "))
+                continue
+            return layout
+        if len(complaints) == 1:
+            raise BadInput(f"{root}: {complaints[0]}")
+        raise BadInput(f"{root}: no layout of {self.name} ({'; '.join(complaints)})")

@@ -1,0 +1,196 @@
+"""Handing out a protocol's occluded training set in a layout that other people's released code reads.
+
+What is written is what a method of the bench is given, pixel for pixel: undistorted, resampled images with hidden
+pixels painted, masks of visible person pixels, the cameras and body poses of the training views; and the cameras and
+poses of the test views, without which nobody could draw them. Nothing that the protocol hides is in any file. The
+body poses are those that the data set ships, which were fitted to un-occluded images, as in every released protocol.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench import __version__, atomic, registry
+from ihbench.body import Body
+from ihbench.camera import Camera
+from ihbench.errors import BadInput
+from ihbench.progress import Progress
+from ihbench.scene import BodyPose, MaskState, TrainView
+from ihbench.views import OccludedScene
+
+MANIFEST = "manifest.json"
+TEST_VIEWS = "test_views.json"
+UNKNOWN_FOLDER = "unknown"  # masks of what the occluder hides, beside the layout's own files
+
+
+@dataclass(frozen=True)
+class HandedView:
+    """One training view as it is handed out. Views are numbered from 0; the manifest says which frame each is."""
+
+    number: int
+    image: NDArray[np.uint8]  # [H, W, 3] RGB, hidden pixels painted with the protocol's background
+    visible: NDArray[np.bool_]  # [H, W] visible person
+    camera: Camera  # without lens distortion
+    body_pose: BodyPose
+
+
+@dataclass(frozen=True)
+class Handout:
+    """What a training layout's writer gets; it looks at the views once, in order."""
+
+    folder: Path  # to write into
+    name: str  # the scene's
+    n_views: int
+    views: Callable[[], Iterator[HandedView]]
+    cameras: list[Camera]  # of the views
+    body_poses: list[BodyPose]  # of the views
+    body: Body
+
+
+TrainingLayout = Callable[[Handout], Path]  # writes the files and returns the subject's folder
+
+
+def prepare(
+    scene: OccludedScene, body: Body, out: Path, layout: str, progress: Progress, force: bool = False
+) -> Path:
+    """Write one scene's training set below `out` and return its folder `out`/NAME, with manifest and test views.
+
+    The folder appears when it is complete. Raises `BadInput` when it exists and `force` is not given, and for an
+    unknown layout.
+    """
+    write: TrainingLayout = registry.load("training layout", layout)
+    target = out / scene.capture.name
+    if target.exists() and not force:
+        raise BadInput(f"{target}: is there already; name another folder with --out, or --force to replace it")
+    partial = out / f".{scene.capture.name}.partial"
+    shutil.rmtree(partial, ignore_errors=True)
+    try:
+        manifest = _write(scene, body, partial, layout, write, progress)
+        if target.exists():
+            shutil.rmtree(target)
+        os.replace(partial, target)
+    except OSError as error:
+        raise BadInput(f"{target}: cannot be written ({error.strerror or error}); name another folder") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    assert manifest
+    return target
+
+
+def _write(
+    scene: OccludedScene, body: Body, folder: Path, layout: str, write: TrainingLayout, progress: Progress
+) -> dict[str, Any]:
+    views: list[TrainView] = scene.train  # type: ignore[assignment]
+    folder.mkdir(parents=True)
+    cameras, poses, states = [], [], []
+    for view in views:
+        cameras.append(view.camera)
+        poses.append(view.body_pose)
+        states.append(hashlib.sha256(np.ascontiguousarray(view.mask).tobytes()).hexdigest())
+
+    def handed() -> Iterator[HandedView]:
+        with progress.task(f"handing out {scene.capture.name}", len(views)) as task:
+            for number, view in enumerate(views):
+                yield HandedView(number, view.image, view.mask == MaskState.PERSON, view.camera, view.body_pose)
+                task.advance()
+
+    try:
+        own = write(Handout(folder, scene.capture.name, len(views), handed, cameras, poses, body))
+    except ValueError as error:
+        raise BadInput(
+            f"layout {layout!r} cannot hold {scene.capture.name}: {error}; choose another --layout"
+        ) from error
+    from ihbench.contact_sheet import write_png
+
+    for number, view in enumerate(views):
+        unknown = np.repeat(((view.mask == MaskState.UNKNOWN) * np.uint8(255))[..., None], 3, axis=2)
+        write_png(own / UNKNOWN_FOLDER / f"{number:06d}.png", unknown)
+    atomic.write_json(folder / TEST_VIEWS, list(_test_views(scene, body)))
+    protocol, capture = scene.protocol, scene.capture
+    manifest = {
+        "made_by": f"ihbench {__version__}",
+        "protocol": protocol.name,
+        "protocol_digest": protocol.digest,
+        "profile": protocol.profile,
+        "content": protocol.content,
+        "dataset": capture.dataset,
+        "variant": capture.variant,
+        "standin": capture.standin,
+        "scene": capture.name,
+        "layout": layout,
+        "body": body.content_sha(),
+        "occlusion": {"rule": scene.hiding.occlusion.rule, **scene.hiding.occlusion.record},
+        "masks": f"visible person; {UNKNOWN_FOLDER}/ shows what is hidden: person or background, nobody knows",
+        "body_poses": "as the data set ships them, fitted to un-occluded images",
+        "train": [
+            {
+                "number": number,
+                "frame": scene.hiding.frames[number],
+                "camera": views[number].camera_id,
+                "covered": scene.hiding.covered[number],
+                "camera_sha256": _sha_of(_camera_words(cameras[number])),
+                "pose_sha256": _sha_of(_pose_words(poses[number])),
+                "mask_sha256": states[number],
+            }
+            for number in range(len(views))
+        ],
+        "test": TEST_VIEWS,
+        "files": {
+            path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+            for path in sorted(folder.rglob("*"))
+            if path.is_file()
+        },
+    }
+    atomic.write_json(folder / MANIFEST, manifest)
+    return manifest
+
+
+def _test_views(scene: OccludedScene, body: Body) -> Iterator[dict[str, Any]]:
+    """The cameras and poses to draw, and the file names under which `ihbench score` looks for the drawings."""
+    from ihbench.body import zju_root
+    from ihbench.views import Undistorter
+
+    lenses: dict[int, Camera] = {}
+    for key in scene.test_keys:
+        if key.camera not in lenses:
+            lenses[key.camera] = Undistorter(scene.capture.camera(key.camera), scene.protocol.image).camera
+        pose = scene.capture.body_pose(key.frame)
+        Rh, Th = zju_root(pose, body)
+        yield {
+            "prediction": f"{scene.capture.name}/{key.name}.png",
+            "camera": key.camera_id,
+            "frame": key.frame,
+            **_camera_words(lenses[key.camera]),
+            **_pose_words(pose),
+            "Rh": Rh.tolist(),
+            "Th": Th.tolist(),
+        }
+
+
+def _camera_words(camera: Camera) -> dict[str, Any]:
+    """Plain numbers; K with OpenCV's pixel centres at integers."""
+    return {
+        "K": camera.K_opencv.tolist(),
+        "R": camera.R.tolist(),
+        "t": camera.t.tolist(),
+        "width": camera.width,
+        "height": camera.height,
+    }
+
+
+def _pose_words(pose: BodyPose) -> dict[str, Any]:
+    return {"pose": pose.pose.tolist(), "betas": pose.betas.tolist(), "transl": pose.transl.tolist()}
+
+
+def _sha_of(words: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(words, sort_keys=True).encode()).hexdigest()

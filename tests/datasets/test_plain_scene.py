@@ -1,0 +1,700 @@
+"""The plain scene folder: written, read back, damaged, and checked."""
+
+import dataclasses
+import json
+import shutil
+import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from ihbench import atomic
+from ihbench.body import load_body
+from ihbench.body.skinning_numpy import axis_angle_to_matrix
+from ihbench.camera import Camera, look_at
+from ihbench.datasets import plain_scene
+from ihbench.datasets.plain_scene import PlainScene, read_cameras, read_poses
+from ihbench.errors import BadInput
+from ihbench.render.zbuffer import rasterize
+from ihbench.scene import BodyPose
+
+WIDTH, HEIGHT = 64, 48
+FRAMES = [3, 4, 10]
+NAMES = ("left", "right")
+
+
+def make_cameras():
+    cameras = {}
+    for k, name in enumerate(NAMES):
+        R, t = look_at([2.2 * np.sin(k), 0.1, 2.2 * np.cos(k)], [0.25, -0.1, 0.1])
+        K = np.array([[45 + k, 0, 31.3], [0, 46 + k, 23.7], [0, 0, 1]])
+        cameras[name] = Camera(K, R, t, WIDTH, HEIGHT, np.array([-0.1, 0.03, 1e-3, -2e-3, 0.01]) if k else None)
+    return cameras
+
+
+def make_poses(body):
+    rng = np.random.default_rng(0)
+    poses = []
+    for _ in FRAMES:
+        pose = rng.normal(0, 0.1, (24, 3))
+        pose[16, 2] = -1.1  # one arm down: not its own mirror image
+        poses.append(BodyPose(pose, rng.normal(size=10), rng.normal(0, 0.05, 3)))
+    return poses
+
+
+def silhouette(body, pose, camera):
+    return rasterize(camera.project(body.pose(pose)), body.faces, camera.height, camera.width).mask
+
+
+def write_scene(folder, body, cameras=None, poses=None, numbers=FRAMES, own=True, root="smpl"):
+    """A whole scene; (images, masks) by (camera, number)."""
+    cameras, poses = cameras or make_cameras(), poses or make_poses(body)
+    plain_scene.write_cameras(folder, cameras)
+    plain_scene.write_poses(folder, poses, numbers, root, body)
+    if own:
+        plain_scene.write_body_file(folder, body)
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    images, masks = {}, {}
+    for k, (name, camera) in enumerate(cameras.items()):
+        for number, pose in zip(numbers, poses, strict=True):
+            smooth = np.stack([4 * x, 5 * y, 60 * (k + 1) + 0 * x + number], -1)
+            images[name, number] = np.clip(smooth, 0, 255).astype(np.uint8)
+            masks[name, number] = silhouette(body, pose, camera)
+            plain_scene.write_frame(
+                folder, number, images[name, number], masks[name, number], name if len(cameras) > 1 else None
+            )
+    return images, masks
+
+
+@pytest.fixture(scope="module")
+def own_body():
+    """Somebody else's SMPL-shaped body, taller than the bench's."""
+    body = load_body()
+    return dataclasses.replace(body, v_template=1.1 * body.v_template, shapedirs=1.1 * body.shapedirs, name="tall")
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory, own_body):
+    folder = tmp_path_factory.mktemp("plain") / "dance"
+    return folder, *write_scene(folder, own_body)
+
+
+@pytest.fixture
+def copy(written, tmp_path):
+    """A copy to damage."""
+    shutil.copytree(written[0], tmp_path / "dance")
+    return tmp_path / "dance"
+
+
+def message(error) -> str:
+    text = str(error.value)
+    assert "\n" not in text
+    assert len(text) < 600
+    return text
+
+
+def problems_of(folder) -> list[str]:
+    (subject,) = plain_scene.check(folder)["subjects"]
+    assert all("\n" not in problem for problem in subject["problems"])
+    return subject["problems"]
+
+
+def change_json(path, change):
+    content = json.loads(path.read_text())
+    change(content["cameras"]["left"], content)
+    path.write_text(json.dumps(content))
+
+
+def change_npz(path, **arrays):
+    old = dict(np.load(path)) | arrays
+    np.savez(path, **{key: value for key, value in old.items() if value is not None})
+
+
+# ----------------------------------------------------------------------------------- what is read back
+
+
+def test_reading_gives_back_what_was_written(written, own_body):
+    folder, images, masks = written
+    capture = PlainScene(folder).open("dance")
+    assert (capture.name, capture.dataset, capture.variant) == ("dance", "custom", "plain")
+    assert (capture.standin, capture.body, capture.n_frames, capture.camera_ids) == ("", "own", 3, NAMES)
+    for k, camera in enumerate(make_cameras().values()):
+        read = capture.camera(k)
+        for name in ("K", "R", "t"):
+            np.testing.assert_allclose(getattr(read, name), getattr(camera, name), atol=1e-12)
+        assert (read.distortion is None) == (camera.distortion is None)
+        if camera.distortion is not None:
+            np.testing.assert_array_equal(read.distortion, camera.distortion)
+        assert (read.width, read.height) == (WIDTH, HEIGHT)
+    for frame, pose in enumerate(make_poses(own_body)):
+        read = capture.body_pose(frame)
+        for name in ("pose", "betas", "transl"):
+            np.testing.assert_array_equal(getattr(read, name), getattr(pose, name))
+        assert capture.number(frame) == FRAMES[frame]
+    for (name, number), image in images.items():
+        camera, frame = NAMES.index(name), FRAMES.index(number)
+        np.testing.assert_array_equal(capture.image(camera, frame), image)
+        np.testing.assert_array_equal(capture.silhouette(camera, frame), masks[name, number])
+    assert capture.model.content_sha() == own_body.content_sha()
+    assert capture.model.name == capture.body
+
+
+@pytest.mark.parametrize("center", [0.0, 0.5])
+def test_pixel_centres_are_as_the_file_says(center, tmp_path):
+    camera = make_cameras()["left"]
+    plain_scene.write_cameras(tmp_path, {"a": camera}, pixel_center=center)
+    stored = json.loads((tmp_path / "cameras.json").read_text())["cameras"]["a"]
+    np.testing.assert_allclose(stored["K"][0][2], 31.3 - 0.5 + center)
+    np.testing.assert_allclose(read_cameras(tmp_path / "cameras.json")["a"].K, camera.K, atol=1e-12)
+    del stored["pixel_center"]  # 0 unless said otherwise
+    (tmp_path / "cameras.json").write_text(json.dumps({"cameras": {"a": stored}}))
+    K = read_cameras(tmp_path / "cameras.json")["a"].K
+    np.testing.assert_allclose(K[:2, 2], camera.K[:2, 2] + center, atol=1e-12)
+
+
+def test_a_single_camera_needs_no_folder_and_jpeg_is_read(tmp_path, own_body):
+    cameras = {"main": make_cameras()["left"]}
+    images, masks = write_scene(tmp_path / "one", own_body, cameras)
+    assert (tmp_path / "one/images/000003.png").is_file()
+    (tmp_path / "one/images/000003.png").unlink()
+    plain_scene.write_frame(tmp_path / "one", 3, images["main", 3], ending="jpg")
+    capture = PlainScene(tmp_path / "one").open("one")
+    assert np.abs(capture.image(0, 0).astype(int) - images["main", 3]).mean() < 2
+    np.testing.assert_array_equal(capture.silhouette(0, 0), masks["main", 3])
+    assert problems_of(tmp_path / "one") == []
+    for kind in ("images", "masks"):  # in a folder of its name it is found as well
+        (tmp_path / "one" / kind).rename(tmp_path / "moved")
+        (tmp_path / "one" / kind).mkdir()
+        (tmp_path / "moved").rename(tmp_path / "one" / kind / "main")
+    capture = PlainScene(tmp_path / "one").open("one")
+    np.testing.assert_array_equal(capture.silhouette(0, 0), masks["main", 3])
+
+
+def test_masks_of_any_kind(copy, written):
+    person = written[2]["left", 3]
+    path = copy / "masks/left/000003.png"
+    opaque = np.full_like(person, 255, np.uint8)
+    for picture in (
+        Image.fromarray(person.astype(np.uint8)),  # 0 and 1
+        Image.fromarray(person),  # one bit
+        Image.fromarray(np.dstack([person * np.uint8(7)] * 3 + [opaque])),  # colour, alpha ignored
+        Image.fromarray(np.dstack([person * np.uint8(7), opaque]), "LA"),
+        Image.fromarray(person.astype(np.uint16) * 256),
+    ):
+        picture.save(path)
+        np.testing.assert_array_equal(PlainScene(copy).open("dance").silhouette(0, 0), person)
+
+
+def test_poses_in_every_layout(copy, own_body):
+    poses = make_poses(own_body)
+    path = copy / "poses.npz"
+    stacked = np.stack([pose.pose for pose in poses])
+    change_npz(path, pose=stacked.reshape(3, 72).astype(np.float32), betas=np.float32([1, 2]), frames=None, root=None)
+    read = read_poses(path)
+    np.testing.assert_allclose(read.pose, stacked, atol=1e-7)
+    np.testing.assert_array_equal(read.betas, np.tile([1, 2], (3, 1)))
+    np.testing.assert_array_equal(read.frames, [0, 1, 2])
+    change_npz(path, frames=np.array([7, 2, 5], np.uint16), betas=np.ones((1, 10)))
+    read = read_poses(path)
+    np.testing.assert_array_equal(read.frames, [2, 5, 7])
+    np.testing.assert_allclose(read.pose, stacked[[1, 2, 0]], atol=1e-7)
+    np.testing.assert_array_equal(read.row(2).transl, poses[0].transl)
+
+
+def test_the_zju_root_is_understood(tmp_path, own_body):
+    poses = make_poses(own_body)
+    off_centre = dataclasses.replace(own_body, v_template=own_body.v_template + np.array([0.02, -0.25, 0.03]))
+    plain_scene.write_cameras(tmp_path / "z", make_cameras())
+    plain_scene.write_body_file(tmp_path / "z", off_centre)
+    plain_scene.write_poses(tmp_path / "z", poses, root="zju", body=off_centre)
+    capture = PlainScene(tmp_path / "z").open("z")
+    for frame, pose in enumerate(poses):
+        np.testing.assert_allclose(capture.body_pose(frame).pose, pose.pose, atol=1e-14)
+        np.testing.assert_allclose(capture.body_pose(frame).transl, pose.transl, atol=1e-14)
+        stored = read_poses(tmp_path / "z/poses.npz")
+        no_root = pose.pose.copy()
+        no_root[0] = 0
+        at_rest = off_centre.pose(BodyPose(no_root, pose.betas, np.zeros(3)))
+        moved = at_rest @ Rotation.from_rotvec(stored.pose[frame, 0]).as_matrix().T + stored.transl[frame]
+        np.testing.assert_allclose(moved, off_centre.pose(pose), atol=1e-12)
+
+
+def test_a_body_without_texture_coordinates_gets_an_atlas(copy, own_body):
+    arrays = dict(np.load(copy / "body.npz"))
+    np.savez(copy / "body.npz", **{key: value for key, value in arrays.items() if key not in ("vt", "ft")})
+    model = PlainScene(copy).open("dance").model
+    assert model.uv_faces.shape == model.faces.shape
+    assert 0 <= model.uv.min() < model.uv.max() <= 1
+    np.testing.assert_array_equal(model.v_template, own_body.v_template)
+
+
+# ---------------------------------------------------------------------------------------------- bodies
+
+
+def test_which_body_a_scene_needs(written, copy, own_body):
+    smpl = dataclasses.replace(load_body(), name="smpl")
+    with pytest.raises(BadInput, match=r"body\.npz.*its own body") as error:
+        PlainScene(copy).open("dance", body=smpl)
+    message(error)
+    capture = PlainScene(copy).open("dance")
+    assert PlainScene(copy).open("dance", body=capture.model).body == "own"
+    (copy / "body.npz").unlink()
+    capture = PlainScene(copy).open("dance")
+    assert capture.body == "smpl"
+    capture.body_pose(0)
+    with pytest.raises(BadInput, match="SMPL"):
+        _ = capture.model
+    with pytest.raises(BadInput, match="procedural body was given"):
+        PlainScene(copy).open("dance", body=load_body())
+    assert PlainScene(copy).open("dance", body=smpl).model is smpl
+
+
+@pytest.mark.parametrize("where", [".", ".."])
+def test_a_marked_folder_is_a_stand_in(where, copy):
+    (copy / "body.npz").unlink()
+    body = load_body()
+    mark = {"generator": "ihbench", "version": 1, "seed": 0, "body": body.name, "body_sha": body.content_sha()}
+    atomic.write_json(copy / where / "STANDIN.json", mark)
+    capture = PlainScene(copy).open("dance")
+    assert (capture.standin, capture.body) == ("stand-in v1 seed 0", "procedural")
+    assert capture.model is body
+
+
+@pytest.mark.parametrize("damage", ["truncated", "flipped", "text", "empty"])
+def test_damaged_body_files_are_bad_input(damage, copy):
+    path = copy / "body.npz"
+    data = bytearray(path.read_bytes())
+    if damage == "flipped":
+        data[len(data) // 2] ^= 0xFF
+    path.write_bytes({"truncated": data[: len(data) // 2], "flipped": data, "text": b"body", "empty": b""}[damage])
+    with pytest.raises(BadInput, match=r"body\.npz") as error:
+        _ = PlainScene(copy).open("dance").model
+    message(error)
+
+
+# --------------------------------------------------------------------------------------------- folders
+
+
+def test_several_scenes_are_named_by_folder_or_file(tmp_path, own_body):
+    for name in ("a", "b"):
+        plain_scene.write_cameras(tmp_path / name, make_cameras())
+        plain_scene.write_poses(tmp_path / name, make_poses(own_body))
+    plain_scene.write_about(tmp_path / "b", "zoe walks", "filmed in the yard")
+    (tmp_path / "notes").mkdir()
+    dataset = PlainScene(tmp_path)
+    assert dataset.subjects() == ["a", "zoe walks"]
+    assert dataset.open("zoe walks").about == "filmed in the yard"
+    with pytest.raises(BadInput, match="did you mean 'zoe walks'"):
+        dataset.open("zoe walk")
+    plain_scene.write_about(tmp_path / "b", "a")
+    with pytest.raises(BadInput, match="named 'a'"):
+        PlainScene(tmp_path)
+    for name in ("", "x/y", "..", "a\nb"):
+        plain_scene.write_about(tmp_path / "b", name)
+        with pytest.raises(BadInput, match=r"scene\.json"):
+            PlainScene(tmp_path)
+    (tmp_path / "b/scene.json").write_text('["name"]')
+    with pytest.raises(BadInput, match=r"scene\.json"):
+        PlainScene(tmp_path)
+
+
+def test_a_scene_folder_may_be_the_current_folder(written, monkeypatch):
+    monkeypatch.chdir(written[0])
+    assert PlainScene(".").subjects() == ["dance"]
+
+
+def test_other_folders_are_bad_input(tmp_path, written):
+    with pytest.raises(BadInput, match="no such folder"):
+        PlainScene(tmp_path / "nowhere")
+    with pytest.raises(BadInput, match=r"neither cameras\.json") as error:
+        PlainScene(tmp_path)
+    message(error)
+    shutil.copytree(written[0], tmp_path / "deep/deeper/dance")
+    with pytest.raises(BadInput, match=r"there is one in .*deeper, give that folder"):
+        PlainScene(tmp_path / "deep")
+    with pytest.raises(BadInput):
+        PlainScene.check(tmp_path / "nowhere")
+
+
+def test_opening_reads_no_picture(copy):
+    for path in copy.rglob("*.png"):
+        path.write_bytes(b"")
+    start = time.perf_counter()
+    capture = PlainScene(copy).open("dance")
+    capture.camera(0)
+    capture.body_pose(0)
+    capture.content_digest(0, 0)
+    assert time.perf_counter() - start < 0.5
+    with pytest.raises(BadInput, match=r"000003\.png"):
+        capture.image(0, 0)
+
+
+# ------------------------------------------------------------------------------------------- bad files
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "text"),
+    [
+        ("K", [[1, 0], [0, 1]], r"K: expected finite numbers of shape \[3, 3\]"),
+        ("K", [[-50, 0, 30], [0, 50, 20], [0, 0, 1]], "fx, fy > 0"),
+        ("K", [[50, 0, 30], [0, 50, 20], [0, 0, 2]], "fx, fy > 0"),
+        ("K", "wide", "K: expected finite"),
+        ("K", [[50, 0, "nan"], [0, 50, 20], [0, 0, 1]], "NaN"),
+        ("R", [[2, 0, 0], [0, 2, 0], [0, 0, 2]], "rotation matrix"),
+        ("R", [[1, 0, 0], [0, 1, 0], [0, 0, -1]], "left-handed"),
+        ("R", None, "R: expected"),
+        ("t", [[0], [0], [1]], r"t: expected finite numbers of shape \[3\]"),
+        ("t", [0, 0, "inf"], "infinity"),
+        ("t", [0, 0, 10**400], "t: expected finite"),
+        ("width", 64.5, "width"),
+        ("width", True, "width"),
+        ("height", 0, "height"),
+        ("height", None, "height"),
+        ("distortion", [0.1], "distortion"),
+        ("pixel_center", 1, "pixel_center"),
+        ("pixel_center", [0.5], "pixel_center"),
+        ("pixel_centre", 0.5, "did you mean 'pixel_center'"),
+    ],
+)
+def test_wrong_cameras_are_bad_input(key, value, text, copy):
+    change_json(copy / "cameras.json", lambda camera, _: camera.update({key: value}))
+    with pytest.raises(BadInput, match=rf"cameras\.json: camera 'left': .*{text}") as error:
+        PlainScene(copy).open("dance")
+    message(error)
+    assert len(problems_of(copy)) == 1
+
+
+@pytest.mark.parametrize("key", ["K", "R", "t", "width", "height"])
+def test_missing_camera_keys_are_bad_input(key, copy):
+    change_json(copy / "cameras.json", lambda camera, _: camera.pop(key))
+    with pytest.raises(BadInput, match=rf"{key}: expected"):
+        PlainScene(copy).open("dance")
+
+
+@pytest.mark.parametrize(
+    ("content", "text"),
+    [
+        ("{", "not valid JSON"),
+        ("[]", "found no camera"),
+        ('{"cameras": {}}', "found no camera"),
+        ('{"cameras": {"a": 3}}', "expected a dictionary"),
+        ('{"cameras": {"../a": {}}}', "camera id"),
+        ('{"cameras": {"a": {}}, "pixel_center": 0.5}', "unknown key 'pixel_center'"),
+        ("[" * 100_000, "nested too deeply"),
+    ],
+)
+def test_wrong_camera_files_are_bad_input(content, text, copy):
+    (copy / "cameras.json").write_text(content)
+    with pytest.raises(BadInput, match=rf"cameras\.json.*{text}") as error:
+        PlainScene(copy).open("dance")
+    message(error)
+
+
+NAN_POSE = np.zeros((3, 72))
+NAN_POSE[1, 5] = np.nan
+
+
+@pytest.mark.parametrize(
+    ("arrays", "text"),
+    [
+        ({"pose": None}, "no array 'pose'"),
+        ({"transl": None}, "no array 'transl'"),
+        ({"pose": np.zeros((3, 69))}, r"\[N, 72\]"),
+        ({"pose": np.zeros(72)}, r"\[N, 72\]"),
+        ({"pose": np.zeros((0, 72))}, r"\[N, 72\]"),
+        ({"pose": NAN_POSE}, "NaN or infinity in row 1"),
+        ({"pose": np.full((3, 72), 90.0)}, "degrees"),
+        ({"pose": np.full((3, 72), "a")}, "expected numbers"),
+        ({"transl": np.zeros((2, 3))}, "transl"),
+        ({"transl": np.full((3, 3), np.inf)}, "transl"),
+        ({"betas": np.zeros((2, 10))}, "betas"),
+        ({"betas": np.zeros((3, 0))}, "betas"),
+        ({"frames": np.arange(4)}, "3 whole numbers"),
+        ({"frames": np.array([1.0, 2, 3])}, "whole numbers"),
+        ({"frames": np.array([1, 2, 1])}, "number 1 appears twice"),
+        ({"frames": np.array([-1, 2, 1])}, "-1 to 2"),
+        ({"root": np.array("pelvis")}, "smpl or zju"),
+        ({"root": np.array(["smpl"])}, "smpl or zju"),
+        ({"poses": np.zeros((3, 72))}, "did you mean 'pose'"),
+    ],
+)
+def test_wrong_poses_are_bad_input(arrays, text, copy):
+    change_npz(copy / "poses.npz", **arrays)
+    with pytest.raises(BadInput, match=rf"poses\.npz: .*{text}") as error:
+        PlainScene(copy).open("dance")
+    message(error)
+    assert len(problems_of(copy)) == 1
+
+
+def test_damaged_pose_files_are_bad_input(copy, tmp_path):
+    path = copy / "poses.npz"
+    data = path.read_bytes()
+    rng = np.random.default_rng(1)
+    refused = same = 0
+    for _ in range(150):
+        changed = bytearray(data)
+        for place in rng.integers(0, len(data), 4):
+            changed[place] ^= 1 << rng.integers(8)
+        path.write_bytes(changed)
+        try:
+            read_poses(path)
+        except BadInput as error:
+            refused += "\n" not in str(error)
+        else:
+            same += 1
+    assert refused + same == 150
+    assert refused > 100
+    for content in (b"", b"PK\x03\x04", data[:1000], data[-1000:], b"\x80\x04N."):
+        path.write_bytes(content)
+        with pytest.raises(BadInput, match=r"poses\.npz"):
+            read_poses(path)
+    path.unlink()
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    (tmp_path / "array.npy").rename(path)
+    with pytest.raises(BadInput, match=r"poses\.npz"):
+        read_poses(path)
+    path.unlink()
+    with pytest.raises(BadInput, match="no such file"):
+        PlainScene(copy).open("dance")
+
+
+def test_pickles_and_giants_in_a_pose_file_are_bad_input(copy, monkeypatch):
+    path = copy / "poses.npz"
+    change_npz(path, pose=np.array([{}], object))
+    with pytest.raises(BadInput, match="plain arrays"):
+        read_poses(path)
+    header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1099511627776,)}"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("pose.npy", b"\x93NUMPY\x01\x00\x50\x00" + header.ljust(79) + b"\n")
+    with pytest.raises(BadInput, match=r"poses\.npz"):
+        read_poses(path)
+    monkeypatch.setattr(plain_scene, "LARGEST_ENTRY", 2**20)
+    np.savez_compressed(path, pose=np.zeros((2000, 72)))
+    with pytest.raises(BadInput, match=r"an array of 1152128 bytes"):
+        read_poses(path)
+
+
+def test_wrong_pictures_are_bad_input(copy):
+    image, mask = copy / "images/left/000003.png", copy / "masks/left/000003.png"
+    image.write_bytes(image.read_bytes()[:60])
+    with pytest.raises(BadInput, match=r"images/left/000003\.png"):
+        PlainScene(copy).open("dance").image(0, 0)
+    image.unlink()
+    mask.unlink()
+    capture = PlainScene(copy).open("dance")
+    for read, where in ((capture.image, "images"), (capture.silhouette, "masks")):
+        with pytest.raises(BadInput, match=rf"{where}/left/000003\.png.*no such file") as error:
+            read(0, 0)
+        message(error)
+    Image.fromarray(np.zeros((HEIGHT, WIDTH + 2, 3), np.uint8)).save(image)
+    with pytest.raises(BadInput, match=r"66×48 px, but cameras\.json says 64×48"):
+        PlainScene(copy).open("dance").image(0, 0)
+    with pytest.raises(BadInput, match="silhouette source 'masks'"):
+        capture.silhouette(0, 1, "masks")
+    for camera, frame in ((2, 0), (-1, 0), (0, 3), (0, -1)):
+        with pytest.raises(BadInput, match=r"no (camera|frame)"):
+            capture.image(camera, frame)
+
+
+def test_digests_follow_the_bytes(copy):
+    before = PlainScene(copy).open("dance").content_digest(0, 0)
+    assert before == PlainScene(copy).open("dance").content_digest(0, 0)
+    seen = {before}
+    for change in (
+        lambda: (copy / "images/left/000003.png").write_bytes(b"other"),
+        lambda: (copy / "masks/left/000003.png").write_bytes(b"other"),
+        lambda: (copy / "masks/left/000003.png").unlink(),
+        lambda: (copy / "images/left/000003.png").unlink(),
+    ):
+        change()
+        seen.add(PlainScene(copy).open("dance").content_digest(0, 0))
+    assert len(seen) == 5
+    assert PlainScene(copy).open("dance").content_digest(0, 0, "none") not in seen
+
+
+# ----------------------------------------------------------------------------------------------- check
+
+
+def test_check_of_a_good_scene(written):
+    found = PlainScene.check(written[0])
+    (subject,) = found["subjects"]
+    assert found["ok"], subject["problems"]
+    assert (found["dataset"], found["layout"], found["standin"]) == ("custom", "plain", "")
+    assert subject["vertices_in_mask"] > 0.98
+    assert subject["mask_on_body"] > 0.98
+    assert subject["body_used"] == "own"
+    expected = {"subject": "dance", "variant": "plain", "body": "own", "cameras": 2, "frames": 3}
+    expected |= {"files": {"image": 6, "mask": 6}, "missing": {"image": 0, "mask": 0, "pose": 0}}
+    expected |= {"sampled_images": 6, "image_size": [[WIDTH, HEIGHT]]}
+    assert {key: subject[key] for key in expected} == expected
+    json.dumps(atomic.encode(found))
+
+
+def smpl_like():
+    """A body whose pelvis lies where SMPL has it."""
+    body = load_body()
+    return dataclasses.replace(body, v_template=body.v_template + np.array([0.0, -0.235, 0.03]), name="smpl")
+
+
+@pytest.mark.parametrize("root", ["smpl", "zju"])
+def test_check_without_the_smpl_model(root, tmp_path):
+    body = smpl_like()
+    poses = [
+        BodyPose(pose.pose, 0.5 * pose.betas, pose.transl + np.array([0, 0.235, -0.03])) for pose in make_poses(body)
+    ]
+    write_scene(tmp_path / "s", body, poses=poses, own=False, root=root)
+    (subject,) = plain_scene.check(tmp_path / "s")["subjects"]
+    assert subject["problems"] == []
+    assert subject["body_used"].startswith("procedural")
+    assert subject["vertices_in_mask"] > 0.85
+    (subject,) = plain_scene.check(tmp_path / "s", body=body)["subjects"]
+    assert subject["body_used"] == "smpl"
+    assert subject["vertices_in_mask"] > 0.98
+
+
+def test_check_names_missing_files(copy):
+    (copy / "masks/left/000004.png").unlink()
+    (copy / "images/right/000010.png").unlink()
+    plain_scene.write_frame(copy, 77, np.zeros((HEIGHT, WIDTH, 3), np.uint8), camera_id="left")
+    (subject,) = plain_scene.check(copy)["subjects"]
+    assert subject["problems"] == [
+        "1 images of camera 'left' have no pose in poses.npz; the first is frame 77",
+        "1 images of camera 'left' have no mask; the first is frame 4",
+        "1 poses have no image of camera 'right'; the first is frame 10",
+    ]
+    assert subject["missing"] == {"image": 1, "mask": 1, "pose": 1}
+
+
+def test_check_names_files_it_does_not_understand(copy):
+    shutil.copy(copy / "images/left/000003.png", copy / "images/left/3.png")
+    shutil.copy(copy / "images/left/000003.png", copy / "images/left/frame_000003.png")
+    shutil.copytree(copy / "images/left", copy / "images/lift")
+    Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint8)).save(copy / "masks/left/000003.jpg")
+    problems = problems_of(copy)
+    assert any("000003.png and 3.png are both frame 3" in problem for problem in problems)
+    assert any("frame_000003.png: 1 such names are ignored" in problem for problem in problems)
+    assert any("000003.jpg: 1 such names are ignored; expected <frame number>.png" in p for p in problems)
+    assert any("lift: cameras.json has no camera of this name" in problem for problem in problems)
+    with pytest.raises(BadInput, match=r"000003\.png and 3\.png are both frame 3"):
+        PlainScene(copy).open("dance").image(0, 0)
+
+
+def each_mask(folder, change):
+    for path in (folder / "masks").rglob("*.png"):
+        Image.fromarray(change(np.array(Image.open(path)))).save(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda mask: 255 - mask, "the masks look inverted"),
+        (lambda mask: mask[:, ::-1].copy(), "mirrored left to right"),
+        (lambda mask: mask[::-1].copy(), "upside down"),
+        (lambda mask: mask[::-1, ::-1].copy(), "turned by 180°"),
+        (lambda mask: np.full_like(mask, 255), "cover whole pictures"),
+        (lambda mask: np.roll(mask, 25, 1), "of the body's vertices project into the silhouettes"),
+        (lambda mask: np.zeros_like(mask), "shows no person"),
+    ],
+)
+def test_check_names_wrong_masks(change, text, copy):
+    each_mask(copy, change)
+    problems = problems_of(copy)
+    assert problems
+    assert all(text in problem for problem in problems)
+    assert len(problems) == (6 if "no person" in text else 1)
+
+
+def test_check_accepts_an_occluded_person(copy):
+    def cut(mask):
+        mask[HEIGHT // 2 :] = 0
+        return mask
+
+    each_mask(copy, cut)
+    assert problems_of(copy) == []
+
+
+def rewrite(folder, body, cameras=None, poses=None):
+    if cameras:
+        plain_scene.write_cameras(folder, cameras)
+    if poses:
+        plain_scene.write_poses(folder, poses, FRAMES)
+
+
+def test_check_names_wrong_units(copy, own_body):
+    cameras, poses = make_cameras(), make_poses(own_body)
+    for factor, text in ((1000, "look like millimetres"), (1e-3, "not in metres")):
+        rewrite(copy, own_body, {n: dataclasses.replace(c, t=factor * c.t) for n, c in cameras.items()}, poses)
+        (problem,) = problems_of(copy)
+        assert "cameras left, right" in problem
+        assert text in problem
+    scaled = [BodyPose(pose.pose, pose.betas, 1000 * (pose.transl + 1)) for pose in poses]
+    rewrite(copy, own_body, cameras, scaled)
+    assert "look like millimetres" in problems_of(copy)[0]
+
+
+def test_check_names_cameras_that_see_no_body(copy, own_body):
+    cameras = make_cameras()
+    turned = dataclasses.replace(cameras["right"], R=np.diag([-1.0, 1, -1]) @ cameras["right"].R)
+    turned = dataclasses.replace(turned, t=np.diag([-1.0, 1, -1]) @ turned.t)
+    rewrite(copy, own_body, cameras | {"right": turned})
+    (problem,) = problems_of(copy)
+    assert "camera right: sees no body" in problem
+    assert "behind it" in problem
+    moved = dataclasses.replace(cameras["right"], t=cameras["right"].t + np.array([9, 0, 0]))
+    rewrite(copy, own_body, cameras | {"right": moved})
+    (problem,) = problems_of(copy)
+    assert "out of the picture" in problem
+
+
+def test_check_of_a_scene_that_cannot_be_opened(copy):
+    (copy / "poses.npz").unlink()
+    found = plain_scene.check(copy)
+    assert not found["ok"]
+    assert "poses.npz: no such file" in found["subjects"][0]["problems"][0]
+
+
+def test_check_without_pictures(copy):
+    shutil.rmtree(copy / "images")
+    problems = problems_of(copy)
+    assert any("images: no such folder" in problem for problem in problems)
+    assert "no image with its mask and pose found" in problems
+
+
+# ----------------------------------------------------------------------------- the page that documents it
+
+
+def test_the_examples_of_the_page_run(tmp_path, own_body):
+    page = Path(plain_scene.__file__).resolve().with_suffix(".md").read_text(encoding="utf-8")
+    assert len(page.splitlines()) <= 120
+    pictures, *examples = [block.split("```")[0] for block in page.split("```python\n")[1:]]
+    assert len(examples) == 4
+    body = dataclasses.replace(own_body, v_template=own_body.v_template + np.array([0.0, -0.25, 0.03]))
+    pelvis = body.joints[0]
+    upright = make_poses(body)[0].pose.copy()
+    for kind, example in zip(("crop", "incam", "world", "easymocap"), examples, strict=True):
+        pose = upright.copy()
+        pose[0] = [0, 0, 0] if kind == "world" else [np.pi, 0, 0]
+        row = {"pose": pose, "rotmat": axis_angle_to_matrix(pose), "betas": np.zeros(10), "shapes": np.zeros((1, 10))}
+        row |= {"trans": -pelvis + [0, 0, 0 if kind == "world" else 3], "cam": (0.9, -pelvis[0], -pelvis[1])}
+        row |= {"box": (32, 24, 40), "poses": pose.reshape(1, 72) * (np.arange(72) > 2), "Rh": pose[:1]}
+        row |= {"Th": np.array([[0, 0, 3.0]]) - axis_angle_to_matrix(pose[0]) @ pelvis}
+        R, t = look_at([0, 0, 3], [0, 0, 0])
+        calibration = {"K": np.array([[45, 0, 31.5], [0, 45, 23.5], [0, 0, 1]]), "R": np.eye(3), "T": np.zeros(3)}
+        known = {"folder": tmp_path / kind, "width": WIDTH, "height": HEIGHT, "focal": 45.0, "body": body}
+        known |= {"hmr": [row], "incam": [row], "world": [row], "easymocap": [row], "R_w2c": R, "t_w2c": t}
+        known |= {"K": calibration["K"], "calibration": {"main": calibration | {"dist": np.zeros(5)}}}
+        known["images"] = [np.zeros((HEIGHT, WIDTH, 3), np.uint8)]
+        exec("from ihbench.datasets import plain_scene\n" + example, known)
+        plain_scene.write_body_file(known["folder"], body)
+        capture = PlainScene(known["folder"]).open(kind)
+        known["masks"] = [255 * silhouette(body, capture.body_pose(0), capture.camera(0)).astype(np.uint8)]
+        middle = np.argwhere(known["masks"][0]).mean(0)
+        np.testing.assert_allclose(middle, [HEIGHT / 2, WIDTH / 2], atol=8)
+        exec(pictures, known)
+        assert problems_of(known["folder"]) == []
+        joints = capture.camera(0).project(capture.model.posed_joints(capture.body_pose(0)))
+        assert joints[15, 1] < joints[0, 1] < joints[7, 1]  # head, pelvis, ankle: upright in the picture
