@@ -51,6 +51,19 @@ class CaptureFolder:
         """Whether `model` can be had: a stand-in's always, real data's when it was given."""
         return self._given_body is not None or bool(self._mark)
 
+    def lacks(self, camera: int, frame: int, source: str = "mask") -> bool:
+        """Whether an image or mask file of this view is missing."""
+        if not (0 <= camera < len(self.camera_ids) and 0 <= frame < self.n_frames):
+            return True
+        try:
+            return not all(path.is_file() for path in self.files_of(camera, frame, source))
+        except BadInput:
+            return True
+
+    def files_of(self, camera: int, frame: int, source: str) -> tuple[Path, ...]:
+        """The picture files of one view. Formats whose frames share files have none."""
+        return ()
+
     def check_index(self, camera: int, frame: int) -> None:
         """Raise `BadInput` for a camera or frame that the capture does not have."""
         if not 0 <= camera < len(self.camera_ids):

@@ -180,6 +180,9 @@ class GaussianAvatarCapture(SnapshotFolder):
                 digest.update(len(data).to_bytes(8, "little") + data)
         return digest.digest()
 
+    def files_of(self, camera: int, frame: int, source: str) -> tuple[Path, ...]:
+        return self._where(frame).image, self.mask_path(frame)
+
     def mask_path(self, frame: int) -> Path:
         entry = self._where(frame)
         return self.folder / entry.split / MASKS / f"{entry.image.stem}.png"

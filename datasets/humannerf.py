@@ -172,6 +172,12 @@ class HumanNerfCapture(CaptureFolder):
             digest.update(path.read_bytes() if path is not None and path.is_file() else b"")
         return digest.digest()
 
+    def files_of(self, camera: int, frame: int, source: str) -> tuple[Path, ...]:
+        name = self._names.get((self.camera_ids[camera], frame))
+        if name is None:
+            raise BadInput(f"{self.folder}: no frame {frame} of camera {self.camera_ids[camera]}")
+        return self._picture("images", name), self._picture("masks", name)
+
     def has(self, camera: int, frame: int) -> bool:
         """Whether the copy lists this view."""
         return (self.camera_ids[camera], frame) in self._names

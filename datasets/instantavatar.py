@@ -160,6 +160,9 @@ class InstantAvatarCapture(SnapshotFolder):
             digest.update(len(data).to_bytes(8, "little") + data)
         return digest.digest()
 
+    def files_of(self, camera: int, frame: int, source: str) -> tuple[Path, ...]:
+        return self.image_path(frame), self.mask_path(frame)
+
     def image_path(self, frame: int) -> Path:
         return self.folder / "images" / f"image_{frame:04d}.png"
 

@@ -27,4 +27,3 @@ OCMOTION = LayoutChoice(
         "ihbench.datasets.ocmotion:OcMotionOriginal",
     ),
 )
-CUSTOM = LayoutChoice("custom", ("ihbench.datasets.plain_scene:PlainScene",))

@@ -108,6 +108,9 @@ class OneCameraCapture(CaptureFolder):
             digest.update(f"{len(content)} ".encode() + content)
         return digest.digest()
 
+    def files_of(self, camera: int, frame: int, source: str) -> tuple[Path, ...]:
+        return self.image_path(camera, frame), self.mask_path(camera, frame)
+
     def image_path(self, camera: int, frame: int) -> Path:
         self.check_index(camera, frame)
         return self._images[frame]
@@ -463,7 +466,10 @@ def checked(dataset: _Sequences, body: Body | None = None, samples: int = 3) -> 
     inverted, or wrong cameras, units or parameters. `vertices_in_mask` is for information, since furniture hides
     vertices. Both need the body model: a stand-in has its own, real captures need `body`, the SMPL model.
     """
-    subjects = [_check_subject(dataset, name, samples, body) for name in dataset.subjects()]
+    try:
+        subjects = [_check_subject(dataset, name, samples, body) for name in dataset.subjects()]
+    except BadInput as error:  # annotations that cannot be read name no subject
+        subjects = [{"subject": "", "problems": [str(error)]}]
     return {
         "dataset": OneCameraCapture.dataset,
         "layout": "original" if isinstance(dataset, OcMotionOriginal) else "w2a",
@@ -508,7 +514,7 @@ def _check_subject(dataset: _Sequences, name: str, samples: int, body: Body | No
             poses[frame] = capture.body_pose(frame)
         except BadInput as error:
             unreadable.append(str(error))
-    problems += unreadable[:LISTED_PROBLEMS]
+    problems += list(dict.fromkeys(unreadable))[:LISTED_PROBLEMS]
     if len(unreadable) > LISTED_PROBLEMS:
         problems.append(f"and so on: the body's parameters are unusable at {len(unreadable)} frames")
     complete = sorted(there["image"] & there["mask"])
@@ -543,15 +549,16 @@ def _sample(
             sizes.add((width, height))
             silhouette = capture.silhouette(0, frame)
             camera = capture.camera(0)
+            vertices = body.pose(poses[frame]) if body is not None and frame in poses else None
         except BadInput as error:
             problems.append(str(error))
             continue
         n_decoded += 1
         n_empty += not silhouette.any()
-        if body is None or frame not in poses or not silhouette.any():
+        if body is None or vertices is None or not silhouette.any():
             continue
         grown = np.asarray(binary_dilation(silhouette, iterations=max(1, width // 100)), bool)
-        inside.append(share_inside(camera.project(body.pose(poses[frame])), grown))
+        inside.append(share_inside(camera.project(vertices), grown))
         overlaps.append(visible_overlap(body, poses[frame], camera, silhouette))
     found["sampled_images"] = n_decoded
     found["image_size"] = sorted([list(size) for size in sizes])

@@ -81,9 +81,9 @@ class PlainScene:
             self._folders[name] = folder
 
     @staticmethod
-    def check(root: Path) -> dict[str, Any]:
+    def check(root: Path, body: Body | None = None) -> dict[str, Any]:
         """What these scenes hold and lack; see `check` below."""
-        return check(root)
+        return check(root, body=body)
 
     def subjects(self) -> list[str]:
         """Names, sorted."""
@@ -172,6 +172,13 @@ class PlainCapture(CaptureFolder):
                 digest.update(path.read_bytes() if path.is_file() else b"")
             digest.update(kind.encode())
         return digest.digest()
+
+    def files_of(self, camera: int, frame: int, source: str) -> tuple[Path, ...]:
+        number = self.number(frame)
+        found = [self.files(kind, camera).get(number, []) for kind in ("images", "masks")]
+        if not all(found):
+            raise BadInput(f"{self.folder}: no image or mask of frame {number}")
+        return tuple(path for paths in found for path in paths)
 
     def number(self, frame: int) -> int:
         """The number that the frame's files carry."""

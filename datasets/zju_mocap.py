@@ -167,6 +167,10 @@ class ZjuCapture(CaptureFolder):
             digest.update(path.read_bytes() if path.is_file() else b"")
         return digest.digest()
 
+    def files_of(self, camera: int, frame: int, source: str) -> tuple[Path, ...]:
+        masks = (self.mask_path(camera, frame, kind) for kind in SILHOUETTES.get(source, ()))
+        return (self.image_path(camera, frame), *masks)
+
     def number(self, frame: int) -> int:
         """The number that the frame's parameter and vertex files carry; 313 and 315 count from 1."""
         self.check_index(0, frame)

@@ -116,6 +116,10 @@ class Capture(Protocol):
         that is missing; reading it will."""
         ...
 
+    def lacks(self, camera: int, frame: int, source: str = "mask") -> bool:
+        """Whether an image or mask file of this view is missing. Decodes nothing, never raises."""
+        ...
+
     def silhouette(self, camera: int, frame: int, source: str = "mask") -> NDArray[np.bool_]:
         """[H, W]. `source` is a data-set specific choice of mask files; a protocol names it."""
         ...

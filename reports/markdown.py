@@ -104,7 +104,8 @@ def _table(
             f"{metric_of(str(i)).title}{metric_of(str(i)).arrow} {t}" for i, t in zip(parsed, titles, strict=True)
         ]
     titles = [  # regions of several presets in one table
-        f"{title} ({i.variant})" if titles.count(title) > 1 else title for i, title in zip(parsed, titles, strict=True)
+        f"{title} ({i.variant})" if titles.count(title) > 1 else title
+        for i, title in zip(parsed, titles, strict=True)
     ]
     costs = ["fit s", "total s", "peak MB"] if with_costs else []
     head = ["method", "scenes", "seeds", *titles, *costs]

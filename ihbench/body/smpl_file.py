@@ -113,7 +113,9 @@ def _plain_array(value: Any, where: str) -> NDArray:
     if isinstance(value, ForeignObject):
         try:
             return _foreign_array(value, where)
-        except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+        except (
+            KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError, MemoryError,
+        ) as error:  # fmt: skip
             raise BadInput(f"{where}: a damaged {value.kind} object ({error!r}); copy the file again") from None
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "biuf":
         kind = value.dtype if isinstance(value, np.ndarray) else type(value).__name__

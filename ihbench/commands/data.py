@@ -21,6 +21,10 @@ class Check:
 
     folder: Annotated[Path, tyro.conf.Positional]
     """The data folder."""
+    body: Path | None = None
+    """SMPL model file for real data (or IHBENCH_BODY): poses are then held against the masks."""
+    overlays: Path = Path("data_check")
+    """Folder for a picture of each subject with the body's outline on its images."""
     json: bool = False
     """Print one JSON object on stdout."""
 
@@ -57,13 +61,20 @@ def main(argv: list[str]) -> int:
 def _check(chosen: Check) -> int:
     if not chosen.folder.is_dir():
         raise BadInput(f"data folder {chosen.folder}: does not exist")
+    from ihbench.body import load_body
+    from ihbench.data_check import add_fitness
+    from ihbench.data_source import body_file, own_body
+
+    named = own_body(chosen.body)
+    body = None if named is None else load_body(body_file(named, "neutral"))
     complaints = []
     for name in registry.names("dataset"):
         try:
-            found = registry.load("dataset", name).check(chosen.folder)
+            found = registry.load("dataset", name).check(chosen.folder, body)
         except BadInput as error:
             complaints.append(f"{name}: {error}")
             continue
+        add_fitness(found, chosen.folder, body, chosen.overlays)
         print(json.dumps(found, ensure_ascii=False) if chosen.json else "\n".join(_lines(found)))
         return 0 if found["ok"] else 1
     raise BadInput(f"data folder {chosen.folder}: no known layout ({'; '.join(complaints)})")

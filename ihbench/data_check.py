@@ -1,0 +1,114 @@
+"""What a copy of a data set is good for: which protocols find their images in it, and pictures of how poses fit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench import registry
+from ihbench.errors import BadInput
+from ihbench.protocol import Protocol, load_protocol
+from ihbench.scene import Capture
+
+if TYPE_CHECKING:
+    from ihbench.body import Body
+    from ihbench.camera import Camera
+    from ihbench.scene import BodyPose
+
+OVERLAY_HEIGHT = 480  # px
+OVERLAY_FRAMES = 3
+BODY_LINE, MASK_LINE = (0, 220, 255), (255, 60, 60)  # RGB: the projected body, the mask
+
+
+def protocols_of(dataset: str) -> list[Protocol]:
+    """The registered protocols on a data set, at the profile that reads most."""
+    found = (load_protocol(name, "paper") for name in registry.names("protocol"))
+    return [protocol for protocol in found if protocol.dataset == dataset]
+
+
+def fitness(capture: Capture, protocol: Protocol) -> str:
+    """ "complete", or what a protocol lacks of a capture, in one line."""
+    n_frames, n_cameras = capture.n_frames, len(capture.camera_ids)
+    training = protocol.training_frames(capture.name, n_frames)
+    tested = protocol.test_views(capture.name, n_frames, n_cameras)
+    views = {(protocol.train_camera, frame) for frame in training} | {(c, f) for c, f, _ in tested}
+    last = max((frame for _, frame in views), default=-1)
+    if not training:
+        return f"no training frame among its {n_frames}"
+    if not tested:
+        return f"no test view: it has {n_cameras} camera{'s' * (n_cameras != 1)}"
+    if last >= n_frames:
+        return f"has {n_frames} frames, needs frame {last}"
+    missing = sum(capture.lacks(camera, frame, protocol.silhouette) for camera, frame in views)
+    return f"{missing} of {len(views)} views missing" if missing else "complete"
+
+
+def overlay(capture: Capture, body: Body, source: str) -> NDArray[np.uint8] | None:
+    """[H, W, 3] frames of the capture with the projected body's outline and the mask's; None where none is readable.
+
+    Beginning, middle and end of what the first camera has. `source` names the masks.
+    """
+    frames = [frame for frame in range(capture.n_frames) if not capture.lacks(0, frame, source)]
+    chosen = sorted({frames[int(k)] for k in np.linspace(0, len(frames) - 1, OVERLAY_FRAMES)}) if frames else []
+    panels = []
+    for frame in chosen:
+        try:
+            image, mask = capture.image(0, frame), capture.silhouette(0, frame, source)
+            panels.append(_outlined(image, mask, body, capture.body_pose(frame), capture.camera(0)))
+        except BadInput:
+            continue  # the check has named it
+    return np.concatenate(panels, axis=1) if panels else None
+
+
+def _outlined(
+    image: NDArray[np.uint8], mask: NDArray[np.bool_], body: Body, body_pose: BodyPose, camera: Camera
+) -> NDArray[np.uint8]:
+    import cv2
+
+    from ihbench.render.zbuffer import rasterize
+
+    height = min(OVERLAY_HEIGHT, image.shape[0])
+    width = max(1, round(image.shape[1] * height / image.shape[0]))
+    view = camera.scaled(width, height)
+    drawn = rasterize(view.project(body.pose(body_pose)), body.faces, height, width).mask
+    out = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    small = cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
+    for region, colour in ((small, MASK_LINE), (drawn.astype(np.uint8), BODY_LINE)):
+        out[(cv2.dilate(region, np.ones((3, 3), np.uint8)) != region)] = colour
+    return out
+
+
+def add_fitness(found: dict[str, Any], root: Path, body: Body | None, overlays: Path | None) -> None:
+    """Extend a check's result: per subject "protocols" (name -> fitness) and "overlay" (a file, or why none)."""
+    from ihbench.contact_sheet import write_png
+
+    if overlays is not None and overlays.resolve().is_relative_to(root.resolve()):
+        raise BadInput(f"--overlays {overlays}: lies in the data folder, which is never written to; name another")
+    protocols = protocols_of(found["dataset"])
+    source = registry.load("dataset", found["dataset"])(root)
+    for subject in found["subjects"]:
+        try:
+            capture = source.open(subject["subject"])
+            subject["protocols"] = {protocol.name: fitness(capture, protocol) for protocol in protocols}
+            if overlays is None:
+                continue
+            if capture.body == "smpl" and body is None:
+                subject["overlay"] = "none: needs the SMPL model file, name it with --body or IHBENCH_BODY"
+                continue
+            if capture.body == "smpl":
+                capture = source.open(subject["subject"], body=body)
+            picture = overlay(capture, capture.model, protocols[0].silhouette if protocols else "mask")
+        except BadInput as error:
+            if not subject["problems"]:
+                subject["problems"].append(str(error))
+                found["ok"] = False
+            continue
+        if picture is None:
+            subject["overlay"] = "none: no frame has image, mask and pose"
+            continue
+        path = overlays / f"{subject['subject']}.png"
+        write_png(path, picture)
+        subject["overlay"] = str(path)
