@@ -19,7 +19,7 @@ import hashlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any, Protocol
 
@@ -148,8 +148,8 @@ class OcMotionOriginal:
     """The folder that holds `annot/train.pkl` or `annot/test.pkl`.
 
     A subject is one person before one camera, named after the folders of the images: "0011_02", and "0011_02_p1" for
-    a further person of the same images. The annotations of the whole release take minutes to read; they are read
-    once, when the first subject is asked for.
+    a further person of the same images. The annotations of the whole release (300,000 images) take minutes to read;
+    they are read once a process, when the first subject is asked for.
     """
 
     def __init__(self, root: Path):
@@ -183,7 +183,8 @@ class OcMotionOriginal:
     def _subjects(self) -> dict[str, _Track]:
         found: dict[str, _Track] = {}
         for path in self._annots:
-            for name, track in _tracks(path).items():
+            file = path.stat()
+            for name, track in _tracks(path, (file.st_ino, file.st_mtime_ns, file.st_size)).items():
                 found[f"{name}_{path.stem}" if name in found else name] = track
         if not found:
             raise BadInput(f"{self._annots[0]}: no person in any frame; expected the annotations of OcMotion")
@@ -257,8 +258,9 @@ class _Track:
     frames: list[tuple[dict, str]]  # with the place, for messages: "annot/train.pkl: sequence 0, camera 1, frame 2"
 
 
-def _tracks(path: Path) -> dict[str, _Track]:
-    """Subjects of one annotation file."""
+@lru_cache(maxsize=len(SPLITS))  # a run asks for the same folder several times
+def _tracks(path: Path, _version: tuple[int, int, int]) -> dict[str, _Track]:
+    """Subjects of one annotation file; another version of the file is another call."""
     content = load_pickle(path)
     found: dict[str, _Track] = {}
     for s, cameras in enumerate(_listed(content, f"{path}", "a list of sequences")):

@@ -18,6 +18,9 @@ def share_inside(points: NDArray[np.float64], region: NDArray[np.bool_]) -> floa
     return float(hits) / len(points)
 
 
+NEAREST, FARTHEST = 0.05, 100.0  # m; nobody films a person from there
+
+
 @dataclass(frozen=True)
 class Overlap:
     """The shares of a body's vertices that project into a silhouette and into what a mistake would make of it."""
@@ -26,6 +29,7 @@ class Overlap:
     outside: float  # its complement in the image
     mirrored: float  # the silhouette flipped left to right, grown as well
     border: float  # the share of the image's border that the silhouette covers
+    depth: float  # m, median of the vertices
 
 
 def overlap_of(points: NDArray[np.float64], silhouette: NDArray[np.bool_]) -> Overlap:
@@ -39,17 +43,31 @@ def overlap_of(points: NDArray[np.float64], silhouette: NDArray[np.bool_]) -> Ov
         share_inside(points, ~silhouette),
         share_inside(points, grown[:, ::-1]),
         float(border.mean()),
+        float(np.median(points[:, 2])),
     )
+
+
+def unit_problem(depth: float) -> str:
+    """What a body's median depth says of the units; empty where nothing. Directions alone cannot tell: a body a
+    thousand times as far away and as far to the side is seen in the same place."""
+    if depth > FARTHEST:
+        return f"bodies are {depth:.3g} m away: camera or body translations look like millimetres; expected metres"
+    if 0 <= depth < NEAREST:
+        return f"bodies are {depth:.3g} m away: translations look like metres where millimetres are meant, or scaled"
+    return ""
 
 
 def overlap_problems(overlaps: Sequence[Overlap]) -> list[str]:
     """What is wrong when too few vertices fall into the silhouettes; empty when nothing is."""
     if not overlaps:
         return []
-    inside, outside, mirrored, border = (
+    inside, outside, mirrored, border, depth = (
         float(np.mean([getattr(overlap, name) for overlap in overlaps]))
-        for name in ("inside", "outside", "mirrored", "border")
+        for name in ("inside", "outside", "mirrored", "border", "depth")
     )
+    wrong_unit = unit_problem(depth)
+    if wrong_unit:
+        return [wrong_unit]
     if outside > 0.8 and border > 0.5:
         return [
             f"the masks look inverted: {outside:.0%} of the body's vertices project outside the silhouettes, which "

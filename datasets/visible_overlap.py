@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ihbench.body import Body
 from ihbench.camera import Camera
+from ihbench.datasets.overlap import unit_problem
 from ihbench.render.zbuffer import rasterize
 from ihbench.scene import BodyPose
 
@@ -28,6 +29,7 @@ class VisibleOverlap:
     mirrored: float  # the mask flipped left to right
     complement: float  # share of the projected body that the mask leaves out
     border: float  # the share of the image's border that the mask covers
+    depth: float  # m, median of the body's vertices
 
 
 def visible_overlap(body: Body, body_pose: BodyPose, camera: Camera, mask: NDArray[np.bool_]) -> VisibleOverlap:
@@ -37,13 +39,18 @@ def visible_overlap(body: Body, body_pose: BodyPose, camera: Camera, mask: NDArr
     step = max(1, max(mask.shape) // SIDE)
     small = mask[step // 2 :: step, step // 2 :: step]
     view = camera.scaled(small.shape[1], small.shape[0])
-    drawn = rasterize(view.project(body.pose(body_pose)), body.faces, view.height, view.width).mask
+    points = view.project(body.pose(body_pose))
+    drawn = rasterize(points, body.faces, view.height, view.width).mask
     rows = np.flatnonzero(drawn.any(1))
     margin = max(1, round(CLOTHES * (np.ptp(rows) + 1))) if len(rows) else 1
     grown = np.asarray(binary_dilation(drawn, iterations=margin), bool)
     border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
     return VisibleOverlap(
-        _share(small, grown), _share(small[:, ::-1], grown), 1 - _share(drawn, small), float(border.mean())
+        _share(small, grown),
+        _share(small[:, ::-1], grown),
+        1 - _share(drawn, small),
+        float(border.mean()),
+        float(np.median(points[:, 2])),
     )
 
 
@@ -58,6 +65,9 @@ def visible_problems(overlaps: Sequence[VisibleOverlap]) -> list[str]:
         return []
     names = ("inside", "mirrored", "complement", "border")
     inside, mirrored, complement, border = (float(np.mean([getattr(o, name) for o in overlaps])) for name in names)
+    wrong_unit = unit_problem(float(np.mean([o.depth for o in overlaps])))
+    if wrong_unit:
+        return [wrong_unit]
     if border > 0.5 and inside < 0.9:
         return [
             f"the masks look inverted: they cover {border:.0%} of the images' borders and leave out {complement:.0%} "

@@ -77,7 +77,7 @@ def studio_camera(rng: np.random.Generator) -> Camera:
     """A camera about 2.9 m before the person at hip height, in the studio's world (z up)."""
     eye = np.array([rng.uniform(-0.05, 0.05), -rng.uniform(2.85, 3.0), rng.uniform(0.85, 1.05)])
     R, t = look_at(eye, np.array([0.0, 0.0, rng.uniform(0.9, 0.95)]), up=np.array([0.0, 0.0, 1.0]))
-    focal = rng.uniform(1280, 1340)
+    focal = rng.uniform(1280, 1340) * SIZE / 1080
     centre = SIZE / 2 + rng.uniform(-6, 6, 2)
     K = np.array([[focal, 0, centre[0]], [0, focal * rng.uniform(0.998, 1.002), centre[1]], [0, 0, 1]])
     k1 = rng.uniform(-0.12, -0.05)

@@ -14,6 +14,8 @@ from ihbench import registry
 from ihbench.commands.parse import options
 from ihbench.errors import BadInput
 
+FIRST = {"zju_mocap": "zju_occ", "people_snapshot": "people_snapshot_occ", "ocmotion": "ocmotion_visible"}
+
 
 @dataclass(frozen=True)
 class Check:
@@ -41,8 +43,8 @@ class Standin:
     """Another seed is another cast: other bodies, clothes and motions."""
     subjects: int = 1
     """How many people."""
-    protocol: str = "zju_occ"
-    """Which images: those that this protocol reads."""
+    protocol: str | None = None
+    """Which images: those that this protocol reads; by default the first protocol on that data set."""
     profile: str = "paper"
     """Profile of that protocol."""
 
@@ -103,7 +105,11 @@ def _standin(chosen: Standin) -> int:
 
     if chosen.subjects < 1:
         raise BadInput(f"--subjects {chosen.subjects}: expected 1 or more")
-    protocol = load_protocol(chosen.protocol, chosen.profile)
+    registry.entry_point("stand-in", chosen.dataset)
+    name = chosen.protocol or FIRST.get(chosen.dataset)
+    if name is None:
+        raise BadInput(f"--protocol: {chosen.dataset!r} is no data set of the bench's own; name one of its protocols")
+    protocol = load_protocol(name, chosen.profile)
     if protocol.dataset != chosen.dataset:
         raise BadInput(f"protocol {protocol.name} is about {protocol.dataset!r}, not {chosen.dataset!r}")
     standin = registry.load("stand-in", chosen.dataset)

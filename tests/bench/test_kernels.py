@@ -109,8 +109,10 @@ def test_lpips_rows_compare_with_the_package():
     assert all(r["value_error"] < 1e-6 for r in rows)
 
 
-def test_scoring_is_timed_on_a_stand_in():
-    rows = scoring.score_rows(1, views=3, profile="quick")
+def test_scoring_is_timed_on_a_stand_in(bench, monkeypatch):
+    monkeypatch.setattr(scoring, "PROTOCOL", str(bench.protocol))
+    with bench.in_its_world():
+        rows = scoring.score_rows(1, views=3, profile="quick")
     assert [r["backend"] for r in rows] == ["psnr+ssim", "psnr+ssim+flip"]
     assert all(r["forward_ms"] > 0 for r in rows)
     assert rows[0]["case"].startswith("3 views@")

@@ -921,6 +921,19 @@ def test_constructor_does_not_read_the_annotations(release):
     OcMotionOriginal(release)
 
 
+def test_annotations_are_read_once_and_again_when_they_change(release, monkeypatch):
+    reads = []
+    load = ocmotion.load_pickle
+    monkeypatch.setattr(ocmotion, "load_pickle", lambda path: reads.append(path) or load(path))
+    for _ in range(2):
+        OcMotionOriginal(release).subjects()
+    assert len(reads) == 1
+    content = annots(release)
+    write_annots(release, [[content[0][1]]])
+    assert OcMotionOriginal(release).subjects() == ["0011_02"]
+    assert len(reads) == 2
+
+
 def test_masks_are_the_users_to_make(release):
     (release / "masks/0011/02/00002.png").unlink()
     with pytest.raises(

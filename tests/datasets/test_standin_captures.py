@@ -1,0 +1,238 @@
+"""The stand-ins of PeopleSnapshot and OcMotion: read by the real loaders, true to their truth, and damage named."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import h5py
+import numpy as np
+import pytest
+from PIL import Image
+
+from ihbench.cli import main
+from ihbench.datasets import people_snapshot
+from ihbench.datasets.layouts import OCMOTION, PEOPLE_SNAPSHOT
+from ihbench.datasets.pickles import write_pickle
+from ihbench.datasets.standin import ocmotion_capture, people_snapshot_capture
+from ihbench.datasets.standin.ocmotion_capture import OcMotionStandIn
+from ihbench.datasets.standin.people_snapshot_capture import PeopleSnapshotStandIn
+from ihbench.errors import BadInput
+
+FRAMES = 6
+
+
+@pytest.fixture(scope="module")
+def snapshot(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(people_snapshot_capture, "N_FRAMES", FRAMES)
+        patch.setattr(people_snapshot_capture, "SIZE", 180)
+        return PeopleSnapshotStandIn.ensure(tmp_path_factory.mktemp("ps") / "root", 0, ["standin-1"], {})
+
+
+@pytest.fixture(scope="module")
+def ocmotion(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ocmotion_capture, "N_FRAMES", FRAMES)
+        patch.setattr(ocmotion_capture, "WIDTH", 240)
+        patch.setattr(ocmotion_capture, "HEIGHT", 180)
+        return OcMotionStandIn.ensure(tmp_path_factory.mktemp("oc") / "root", 0, ["standin-2"], {})
+
+
+def test_the_snapshot_person_turns_once_and_a_half_before_the_camera(snapshot):
+    capture = PEOPLE_SNAPSHOT(snapshot).open("standin-1")
+    assert (capture.standin, capture.body, capture.n_frames) == ("stand-in v1 seed 0", "procedural", FRAMES)
+    camera = capture.camera(0)
+    np.testing.assert_allclose(camera.R, np.eye(3), atol=1e-12)
+    assert not camera.t.any()
+    assert camera.distortion is not None
+    facing = []
+    for frame in range(FRAMES):
+        pose = capture.body_pose(frame)
+        mask = capture.silhouette(0, frame)
+        points = camera.project(capture.model.pose(pose))
+        column, row = points[:, 0].astype(int), points[:, 1].astype(int)
+        grown = mask | np.roll(mask, 1, 0) | np.roll(mask, -1, 0) | np.roll(mask, 1, 1) | np.roll(mask, -1, 1)
+        assert grown[row, column].mean() > 0.97  # the same body in the camera's world
+        facing.append(-np.linalg.det(np.eye(3)) * capture.model.pose(pose)[:, 2].mean())
+        chest, spine = (capture.model.posed_joints(pose)[k] for k in (15, 12))  # head and neck
+        assert chest[1] < spine[1]  # OpenCV axes: up is negative
+    front = [_heading(capture, frame) for frame in range(FRAMES)]
+    turned = np.unwrap(front)
+    assert abs(turned[-1] - turned[0]) == pytest.approx(3 * np.pi, abs=0.3)
+    assert abs(front[0]) < 0.2  # faces the camera first
+
+
+def _heading(capture, frame):
+    """rad; 0 when the body's front looks at the camera."""
+    joints = capture.model.posed_joints(capture.body_pose(frame))
+    across = joints[1] - joints[2]  # left hip from right hip
+    return np.arctan2(across[2], across[0])
+
+
+def test_ocmotion_masks_are_what_furniture_leaves_of_the_truth(ocmotion):
+    capture = OCMOTION(ocmotion).open("standin-2")
+    folder = ocmotion / "standin-2"
+    assert (capture.standin, capture.body, capture.n_frames) == ("stand-in v1 seed 0", "procedural", FRAMES)
+    shares = []
+    for frame in range(FRAMES):
+        visible = capture.silhouette(0, frame, "visible")
+        whole = np.asarray(Image.open(folder / "truth" / "masks" / f"{frame:05d}.png")) > 0
+        assert not (visible & ~whole).any()
+        shares.append(visible.sum() / whole.sum())
+        image = capture.image(0, frame).astype(int)
+        clear = np.asarray(Image.open(folder / "truth" / "images" / f"{frame:05d}.jpg")).astype(int)
+        assert abs(image - clear)[visible].mean() < 12  # the truth is JPEG
+        hidden = whole & ~visible
+        assert hidden.sum() < 20 or abs(image - clear)[hidden].mean() > 15
+    assert min(shares) < 0.75  # furniture really hides people
+    assert max(shares) > 0.3
+    assert len(capture.novel_cameras(0)) == 6
+
+
+def test_the_room_is_the_same_whoever_asks_again(ocmotion, tmp_path, monkeypatch):
+    monkeypatch.setattr(ocmotion_capture, "N_FRAMES", FRAMES)
+    monkeypatch.setattr(ocmotion_capture, "WIDTH", 240)
+    monkeypatch.setattr(ocmotion_capture, "HEIGHT", 180)
+    again = OcMotionStandIn.ensure(tmp_path / "again", 0, ["standin-2"], {})
+    for path in sorted((ocmotion / "standin-2").rglob("*.*")):
+        assert path.read_bytes() == (again / path.relative_to(ocmotion)).read_bytes(), path.name
+    missing = again / "standin-2" / "truth" / "masks" / "00003.png"
+    before = (again / "standin-2" / "images" / "00003.png").read_bytes()
+    missing.unlink()
+    (again / "standin-2" / "images" / "00003.png").unlink()
+    OcMotionStandIn.ensure(again, 0, ["standin-2"], {})  # goes on where it was interrupted
+    assert (again / "standin-2" / "images" / "00003.png").read_bytes() == before
+    with pytest.raises(BadInput, match="another stand-in"):
+        OcMotionStandIn.ensure(again, 1, ["standin-2"], {})
+
+
+def invert(folder):
+    with h5py.File(folder / "masks.hdf5", "r+") as file:
+        file["masks"][...] = 1 - file["masks"][...]
+
+
+def mirror(folder):
+    with h5py.File(folder / "masks.hdf5", "r+") as file:
+        # the person stands in the middle: shifted to one side first, or their mirror image would fit too
+        file["masks"][...] = np.roll(file["masks"][...], 60, axis=2)[..., ::-1]
+
+
+def cut(path, share=0.5):
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * share)])
+
+
+def edit_poses(folder, key, change):
+    with h5py.File(folder / "reconstructed_poses.hdf5", "r+") as file:
+        file[key][...] = change(file[key][...])
+
+
+def camera_without_focal(folder):
+    from ihbench.safe_pickle import load_pickle
+
+    camera = load_pickle(folder / "camera.pkl")
+    del camera["camera_f"]
+    write_pickle(folder / "camera.pkl", camera)
+
+
+class Boom:
+    def __reduce__(self):
+        return print, ("hostile",)
+
+
+def hostile(folder):
+    import pickle
+
+    (folder / "camera.pkl").write_bytes(pickle.dumps(Boom()))
+
+
+SNAPSHOT_DAMAGES = {
+    "inverted": (invert, "inverted"),
+    "elsewhere": (mirror, "project into the silhouettes"),
+    "hdf5 cut short": (lambda f: cut(f / "masks.hdf5"), "masks.hdf5"),
+    "video cut short": (lambda f: cut(f / "standin-1.mp4", 0.3), "standin-1.mp4"),
+    "no video": (lambda f: (f / "standin-1.mp4").unlink(), "standin-1.mp4"),
+    "NaN": (lambda f: edit_poses(f, "pose", lambda p: np.where(np.arange(72) == 5, np.nan, p)), "NaN"),
+    "millimetres": (lambda f: edit_poses(f, "trans", lambda t: 1000 * t), "millimetres"),
+    "no focal length": (camera_without_focal, "camera_f"),
+    "hostile": (hostile, "camera.pkl"),
+}
+
+
+@pytest.mark.parametrize("name", SNAPSHOT_DAMAGES)
+def test_data_check_names_the_damage_of_a_snapshot(snapshot, tmp_path, capsys, name):
+    damage, words = SNAPSHOT_DAMAGES[name]
+    shutil.copytree(snapshot, tmp_path / "copy")
+    assert _check(tmp_path, capsys)[0] == 0
+    damage(tmp_path / "copy" / "standin-1")
+    status, found = _check(tmp_path, capsys)
+    assert status == 1
+    assert words in " ".join(found["subjects"][0]["problems"]), found
+
+
+def rewrite(folder, change):
+    path = folder / "metadata.json"
+    words = json.loads(path.read_text())
+    change(words)
+    path.write_text(json.dumps(words))
+
+
+def edit_masks(folder, change):
+    for path in (folder / "masks").iterdir():
+        Image.fromarray(change(np.asarray(Image.open(path)))).save(path)
+
+
+OCMOTION_DAMAGES = {
+    "inverted": (lambda f: edit_masks(f, lambda m: 255 - m), "inverted"),
+    "mirrored": (lambda f: edit_masks(f, lambda m: np.ascontiguousarray(m[:, ::-1])), "mirrored"),
+    "millimetres": (
+        lambda f: rewrite(f, lambda w: [e.update(trans=[1000 * x for x in e["trans"]]) for e in w.values()]),
+        "divide 'trans' by 1000",
+    ),
+    "no entry": (lambda f: rewrite(f, lambda w: w.pop("00003")), "00003"),
+    "twice": (lambda f: shutil.copy(f / "images" / "00001.png", f / "images" / "00001.jpg"), "00001"),
+    "not JSON": (lambda f: cut(f / "metadata.json"), "metadata.json"),
+    "infinite": (lambda f: rewrite(f, lambda w: w["00001"].update(trans=[0, 0, float("inf")])), "trans"),
+}
+
+
+@pytest.mark.parametrize("name", OCMOTION_DAMAGES)
+def test_data_check_names_the_damage_of_a_sequence(ocmotion, tmp_path, capsys, name):
+    damage, words = OCMOTION_DAMAGES[name]
+    shutil.copytree(ocmotion, tmp_path / "copy")
+    assert _check(tmp_path, capsys)[0] == 0
+    damage(tmp_path / "copy" / "standin-2")
+    status, found = _check(tmp_path, capsys)
+    assert status == 1
+    assert words in " ".join(found["subjects"][0]["problems"]), found
+
+
+def test_data_check_writes_a_picture_and_leaves_the_data_alone(ocmotion, tmp_path, capsys):
+    before = {p: p.read_bytes() for p in ocmotion.rglob("*") if p.is_file()}
+    status = main(["data", "check", str(ocmotion), "--overlays", str(tmp_path / "seen"), "--json"])
+    found = json.loads(capsys.readouterr().out)
+    assert status == 0
+    assert found["subjects"][0]["protocols"]["ocmotion_visible@1"].startswith("has 6 frames")
+    picture = np.asarray(Image.open(tmp_path / "seen" / "standin-2.png"))
+    assert picture.shape == (180, 3 * 240, 3)
+    assert (picture == (0, 220, 255)).all(-1).any()  # the body's outline
+    assert before == {p: p.read_bytes() for p in ocmotion.rglob("*") if p.is_file()}
+    assert main(["data", "check", str(ocmotion), "--overlays", str(ocmotion / "x")]) == 2
+    assert "never written to" in capsys.readouterr().err
+
+
+def _check(tmp_path, capsys):
+    capsys.readouterr()
+    status = main(["data", "check", str(tmp_path / "copy"), "--overlays", str(tmp_path / "seen"), "--json"])
+    out = capsys.readouterr().out
+    return status, json.loads(out) if out else {}
+
+
+def test_the_video_is_close_to_what_was_filmed(snapshot):
+    """The codec loses something, as the real videos have; not more than 8-bit noise of a few levels."""
+    capture = people_snapshot.PeopleSnapshotRaw(snapshot).open("standin-1")
+    texture = np.asarray(Image.open(snapshot / "standin-1" / "truth" / "texture.png"))
+    assert texture.shape[2] == 3
+    image, mask = capture.image(0, 0), capture.silhouette(0, 0)
+    assert image[mask].std() > 20  # a clothed person, not a grey smear
