@@ -1,0 +1,169 @@
+"""Protocols beside zju_occ, end to end: severities, groups of test views, one's own video, handing out and back."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from ihbench.body import load_body
+from ihbench.cli import main
+from ihbench.contact_sheet import write_png
+from ihbench.data_source import locate
+from ihbench.datasets import plain_scene
+from ihbench.errors import BadInput
+from ihbench.progress import Progress
+from ihbench.protocol import load_protocol
+from ihbench.results import read_result
+from ihbench.views import open_scene
+from tests.bench.fake_capture import a_camera, a_pose, photograph
+
+
+@pytest.fixture(scope="module")
+def own_video(tmp_path_factory):
+    """A plain scene folder of ten frames with a body of its own, as somebody's pose estimator would leave it."""
+    folder = tmp_path_factory.mktemp("video") / "mein Vidéo"
+    camera = a_camera(size=96)
+    poses = [a_pose(0.5 * k, 0.3) for k in range(10)]
+    plain_scene.write_cameras(folder, {"phone": camera})
+    plain_scene.write_poses(folder, poses)
+    plain_scene.write_body_file(folder, load_body())
+    for k, pose in enumerate(poses):
+        plain_scene.write_frame(folder, k, *photograph(camera, pose))
+    return folder
+
+
+def test_a_video_of_ones_own_runs_with_its_own_body(own_video, tmp_path, mannequin, bench, capsys):
+    words = ["run", "--protocol", "custom_occ", "--data", own_video, "--runs", tmp_path, "--method", "mannequin"]
+    with bench.in_its_world():
+        status = main([str(w) for w in (*words, "--occlusion.rule", "central-band", "--occlusion.fraction", "0.3")])
+    assert status == 0, capsys.readouterr().err
+    (folder,) = (p.parent for p in tmp_path.glob("*/run.json"))
+    result = read_result(folder)
+    assert result.record["about"]["body"] == "own"
+    assert result.record["about"]["standin"] == ""
+    assert result.record["identity"]["protocol"] == "custom_occ@1+occlusion=central-band,fraction=0.3"
+    assert 0.3 <= result.record["about"]["hidden_share"] < 0.36
+    report = bench("report", folder, "--preset", "gauhuman", "--data", own_video)
+    assert report.status == 0, report.err
+    assert "real data (plain)" in report.out
+
+
+def test_frames_are_flags(own_video):
+    protocol = load_protocol("custom_occ").with_frames("0:8:4", "1::3")
+    scene = open_scene(*_opened(protocol, own_video))
+    assert scene.hiding.frames == (0, 4)
+    assert [key.frame for key in scene.test_keys] == [1, 4, 7]
+    assert protocol.name == "custom_occ@1+train=0:8:4+test=1::3"
+    assert protocol.digest != load_protocol("custom_occ").digest
+    for bad in ("a:b", "5", "3:1", "0:9:0", "-1:5"):
+        with pytest.raises(BadInput, match=r"START:STOP:STEP|stop above"):
+            load_protocol("custom_occ").with_frames(train=bad)
+
+
+def _opened(protocol, data, scene=None):
+    source = locate(protocol, data, (scene,) if scene else ())
+    capture, _ = source.open(source.scenes[0], None, Progress.silent())
+    return capture, protocol
+
+
+@pytest.mark.parametrize(
+    "rule", ["strip-generic", "central-band", "side", "lower-half", "upper-half", "blocks", "object"]
+)
+def test_severity_asked_is_severity_hidden(bench, rule):
+    """On a stand-in, within 2 % of the person; the strip is as coarse as two of its columns."""
+    with bench.in_its_world():
+        for fraction in (0.1, 0.3, 0.5, 0.7, 0.9):
+            protocol = load_protocol(str(bench.protocol)).with_occlusion(rule, fraction)
+            hidden = open_scene(*_opened(protocol, None, "standin-1")).hiding.hidden_share()
+            assert fraction <= hidden <= fraction + 0.02, (fraction, hidden)
+
+
+def test_several_severities_are_several_runs(bench, mannequin):
+    outcome = bench.run("--occlusion.fraction", "0.2", "0.6", "--runs", bench.runs / "sweep", method="mannequin")
+    assert outcome.status == 0, outcome.err
+    names = {json.loads(p.read_text())["identity"]["protocol"] for p in (bench.runs / "sweep").glob("*/run.json")}
+    assert {name.rpartition("fraction=")[2] for name in names} == {"0.2", "0.6"}
+    assert outcome.out.count("## ") >= 2  # never in one table
+
+
+def test_shares_outside_0_to_1_are_refused(bench):
+    for words in (["--occlusion.fraction", "1.2"], ["--occlusion.covers", "-0.1"]):
+        outcome = bench.run(*words)
+        assert outcome.status == 2
+        assert "expected a share from 0 to 1" in outcome.err
+    outcome = bench(
+        "score", "--protocol", bench.protocol, "--predictions", bench.cache, "--occlusion.fraction", "0.1", "0.2"
+    )
+    assert outcome.status == 2
+
+
+def test_the_released_score_stands_beside_the_held_out_one(tmp_path, bench, mannequin, monkeypatch):
+    from ihbench.datasets.standin import ocmotion_capture
+
+    for name, value in (("N_FRAMES", 100), ("WIDTH", 96), ("HEIGHT", 72)):
+        monkeypatch.setattr(ocmotion_capture, name, value)
+    root = ocmotion_capture.OcMotionStandIn.ensure(tmp_path / "oc", 0, ["standin-1"], {})
+    words = [
+        "run",
+        "--protocol",
+        "ocmotion_visible",
+        "--data",
+        root,
+        "--runs",
+        tmp_path / "runs",
+        "--method",
+        "mannequin",
+    ]
+    outcome = bench(*words)
+    assert outcome.status == 0, outcome.err
+    (folder,) = (p.parent for p in (tmp_path / "runs").glob("*/run.json"))
+    rows = read_result(folder).rows
+    assert {"mannequin", "mannequin [train = test]"} <= set(rows)
+    identity = "psnr/pooled/range1/body/v1"
+    assert rows["mannequin"][identity].value != rows["mannequin [train = test]"][identity].value
+    assert "| mannequin [train = test] |" in outcome.out
+    frames = {(line["row"], line["frame"] % 2) for line in map(json.loads, (folder / "scores.jsonl").open())}
+    assert frames == {("mannequin", 1), ("mannequin [train = test]", 0)}
+
+
+def test_what_is_handed_out_can_be_drawn_and_scored(bench, tmp_path):
+    out = bench(
+        "prepare",
+        "--protocol",
+        bench.protocol,
+        "--profile",
+        "quick",
+        "--out",
+        tmp_path,
+        "--scene",
+        "standin-1",
+        "--json",
+    )
+    assert out.status == 0, out.err
+    told = json.loads(out.out)
+    assert told["layout"] == "zju"
+    folder = tmp_path / "standin-1"
+    with bench.in_its_world():
+        scene = open_scene(*_opened(load_protocol(str(bench.protocol)), None, "standin-1"))
+        for row, view in zip(json.loads((folder / "test_views.json").read_text()), scene.test, strict=True):
+            write_png(tmp_path / "drawn" / row["prediction"], np.rint(view.image * 255).astype(np.uint8))
+    scored = bench(
+        "score",
+        "--protocol",
+        bench.protocol,
+        "--predictions",
+        tmp_path / "drawn",
+        "--runs",
+        tmp_path / "runs",
+        "--json",
+    )
+    assert scored.status == 0, scored.err
+    scores = json.loads(scored.out)["runs"][0]["scores"]["drawn"]
+    assert scores["ssim/gauss11-1.5/range1/body/v1"] == 1.0
+    again = bench(
+        "prepare", "--protocol", bench.protocol, "--profile", "quick", "--out", tmp_path, "--scene", "standin-1"
+    )
+    assert again.status == 2
+    assert "is there already" in again.err
