@@ -209,7 +209,8 @@ def betas_of_joints(joints: NDArray[np.float64], body: Body) -> NDArray[np.float
     """[10] shape coefficients whose rest-pose joints are `joints` [24, 3] m, in the sense of least squares."""
     zero = body.shaped(np.zeros(BETAS))[1]
     columns = [(body.shaped(np.eye(BETAS)[k])[1] - zero).ravel() for k in range(BETAS)]
-    return np.linalg.lstsq(np.stack(columns, 1), (joints - zero).ravel(), rcond=None)[0]
+    solution = np.linalg.lstsq(np.stack(columns, 1), (joints - zero).ravel(), rcond=None)[0]
+    return solution.astype(np.float64)
 
 
 def _dictionary(path: Path) -> dict[str, Any]:

@@ -74,7 +74,7 @@ def _outlined(
     width = max(1, round(image.shape[1] * height / image.shape[0]))
     view = camera.scaled(width, height)
     drawn = rasterize(view.project(body.pose(body_pose)), body.faces, height, width).mask
-    out = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    out = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
     small = cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
     for region, colour in ((small, MASK_LINE), (drawn.astype(np.uint8), BODY_LINE)):
         out[(cv2.dilate(region, np.ones((3, 3), np.uint8)) != region)] = colour

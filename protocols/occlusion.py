@@ -189,7 +189,7 @@ def natural(request: OcclusionRequest) -> Occlusion:
         if len(rows) == 0:
             return np.zeros(person.shape, bool)
         margin = max(1, round(CLOTHES * (rows[-1] - rows[0] + 1)))
-        return np.asarray(binary_dilation(body, iterations=margin)) & ~person
+        return np.asarray(binary_dilation(body, iterations=margin), bool) & ~person
 
     return _per_frame("natural", request, hidden)
 

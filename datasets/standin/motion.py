@@ -23,7 +23,7 @@ from ihbench.scene import BodyPose
 Array = NDArray[np.float64]
 
 N_FRAMES = 570  # of the exercises that a ZJU-MoCap stand-in shows
-NOVEL_FRAMES = 120  # and of the movements after them, which the protocol `novel_pose` tests on
+NOVEL_FRAMES = 240  # and of the movements after them, which the protocol `novel_pose` tests on
 FRAMES_PER_SECOND = 30
 CROSSFADE = 36  # frames from one exercise to the next
 SMPL_UP_TO_WORLD_UP = Rotation.from_euler("x", 90, degrees=True)  # y up, facing +z -> z up, facing -y

@@ -65,7 +65,7 @@ class Subject:
     @cached_property
     def novel_performance(self) -> motion.Performance:
         """What they do after the exercises: movements that nobody makes among those."""
-        return motion.perform(self.rng("novel"), motion.NOVEL, full_turn=True, n_frames=motion.NOVEL_FRAMES)
+        return motion.perform(self.rng("novel"), motion.NOVEL, full_turn=False, n_frames=motion.NOVEL_FRAMES)
 
     @cached_property
     def body_poses(self) -> list[BodyPose]:

@@ -32,7 +32,7 @@ FIGURES = {"1/20": (0.55, 0.27), "1/10": (0.75, 0.4), "1/3": (1.0, 1.0)}  # shar
 FRAME_REGIONS = ("full", "box", "body", "visible", "hidden", "never_seen")
 
 Pair = tuple[NDArray, NDArray]
-Metric = Callable[[NDArray, NDArray], float]
+Metric = Callable[..., float]  # of two images
 
 
 def ssim_rows(repeats: int, size: int = SIZE) -> list[Row]:
@@ -138,7 +138,7 @@ def _framed_person(extent: tuple[float, float], height: int, width: int, dtype: 
     for name, mask in inner.regions.items():
         regions[name][area] = mask
     regions["full"][:] = True
-    return Case(f"framed {inner.name}", *images, regions)
+    return Case(f"framed {inner.name}", images[0], images[1], regions)
 
 
 def _compared(
@@ -251,8 +251,8 @@ def _kornia(pred: NDArray, truth: NDArray) -> float:
 def _flip_evaluator(pred: NDArray, truth: NDArray) -> float:
     import flip_evaluator
 
-    images = (np.ascontiguousarray(np.clip(image, 0, 1), np.float32) for image in (truth, pred))
-    return float(flip_evaluator.evaluate(*images, "LDR", applyMagma=False)[1])
+    reference, test = (np.ascontiguousarray(np.clip(image, 0, 1), np.float32) for image in (truth, pred))
+    return float(flip_evaluator.evaluate(reference, test, "LDR", applyMagma=False)[1])
 
 
 def _channels_first(image: NDArray) -> Any:

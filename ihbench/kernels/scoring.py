@@ -48,7 +48,7 @@ def score_rows(repeats: int, views: int = VIEWS, profile: str = PROFILE) -> list
             off = np.roll(scene.test[index].image, 1, axis=1)
             write_png(folder / "in" / f"{index}.png", rounded(off))
         for case, metrics in CASES.items():
-            samples = []
+            samples, memory = [], None
 
             def score_all(scorer: Scorer) -> None:
                 def predict(loaded):

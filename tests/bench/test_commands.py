@@ -188,7 +188,7 @@ def test_export_in_a_frames_pose_never_takes_another_person(bench_with_run, tmp_
         registry.load("stand-in", "zju_mocap").ensure(tmp_path / "cast", 1, ["standin-1"], {0: [0]})
     outcome = bench_with_run("export", folder, "--pose", "0", "--data", tmp_path / "cast")
     assert outcome.status == 2
-    assert "holds stand-in v1 seed 1, the run was made on stand-in v1 seed 0" in outcome.err
+    assert "holds stand-in v2 seed 1, the run was made on stand-in v2 seed 0" in outcome.err
 
 
 # -------------------------------------------------------------------------------------------------------- data
@@ -204,11 +204,11 @@ def test_a_stand_in_written_on_request_passes_the_check_and_runs(bench, tmp_path
     ]
     check = bench("data", "check", tmp_path / "cast", "--json")
     told = json.loads(check.out)
-    assert (check.status, told["ok"], told["standin"]) == (0, True, "stand-in v1 seed 3")
-    assert "standin: stand-in v1 seed 3" in bench("data", "check", tmp_path / "cast").out
+    assert (check.status, told["ok"], told["standin"]) == (0, True, "stand-in v2 seed 3")
+    assert "standin: stand-in v2 seed 3" in bench("data", "check", tmp_path / "cast").out
     run = bench.run(*words, "--data", tmp_path / "cast", method=mannequin)
     assert run.status == 0
-    assert "**stand-in v1 seed 3**" in run.out
+    assert "**stand-in v2 seed 3**" in run.out
 
 
 def test_data_check_names_what_is_wrong_and_returns_1(bench, tmp_path):

@@ -231,7 +231,9 @@ def test_gaussianavatar_reads_its_layout(scene, tmp_path):
     for i, path in enumerate(images):
         mask = read_png(root / "masks" / path.name)
         check_pixels(scene, i, read_png(path), (mask if mask.ndim == 2 else mask[..., 0]) >= 128)
-        vertices = smpl_vertices(smpl["body_pose"][i], smpl["beta"][0].double().numpy(), smpl["trans"][i].double())
+        vertices = smpl_vertices(
+            smpl["body_pose"][i].numpy(), smpl["beta"][0].double().numpy(), smpl["trans"][i].double().numpy()
+        )
         check_projection(scene, i, camera["intrinsic"], camera["extrinsic"], vertices)
 
 

@@ -48,7 +48,7 @@ def no_fit(monkeypatch):
 
 def test_a_run_ends_with_a_table_that_says_stand_in_and_with_a_complete_folder(finished):
     assert finished.outcome.status == 0
-    assert "stand-in v1 seed 0" in finished.outcome.out
+    assert "stand-in v2 seed 0" in finished.outcome.out
     assert "| inpainthuman" in finished.outcome.out
     assert str(finished.folder / "contact_sheet.png") in finished.outcome.out
     files = {name for name in contents(finished.folder) if not name.startswith("renders/")}
@@ -128,7 +128,7 @@ def test_json_is_one_object_and_nothing_else(bench_with_run, finished):
     told = json.loads(line, parse_constant=lambda name: pytest.fail(f"{name} is not strict JSON"))
     assert (outcome.status, told["status"]) == (0, "done")
     (run,) = told["runs"]
-    assert run["standin"] == "stand-in v1 seed 0"
+    assert run["standin"] == "stand-in v2 seed 0"
     assert run["scores"]["inpainthuman"] == atomic.encode(means(finished.folder))
     assert run["scores"]["truth"]["psnr/pooled/range1/full/v1"] == "inf"
 

@@ -49,9 +49,17 @@ def test_the_two_readings_disagree_on_exactly_two_strips():
 
 @pytest.mark.parametrize("name", registry.names("protocol"))
 @pytest.mark.parametrize("profile", ["quick", "paper"])
-def test_every_shipped_protocol_reads_and_leaves_the_training_camera_out_of_the_test(name, profile):
+def test_every_shipped_protocol_reads_and_tests_on_no_view_that_it_trains_on(name, profile):
     protocol = load_protocol(name, profile)
-    assert protocol.train_camera not in protocol.testing_cameras(23)
+    for subject in (*protocol.subjects, *protocol.standin_subjects, "anybody"):
+        trained = {(protocol.train_camera, frame) for frame in protocol.training_frames(subject, 1000)}
+        assert trained
+        groups = {}
+        for camera, frame, group in protocol.test_views(subject, 1000, 23):
+            groups.setdefault(group, set()).add((camera, frame))
+        shared = groups[""] & trained
+        assert not shared, (subject, shared)
+        assert all(name == "train = test" and views <= trained for name, views in groups.items() if name)
     assert protocol.id == name
     assert protocol.dataset in registry.names("dataset")
     assert {protocol.occlusion.rule, protocol.occlusion.unlisted} <= set(registry.names("occlusion"))
