@@ -168,11 +168,15 @@ class _Run(RecordedRun):
         request, protocol = self.request, self.request.protocol
         with self.ledger.stage("occlude"):
             scene = open_scene(self.capture, protocol)
-        with self.ledger.stage("load"):
-            scene.train.preload()
-        with self.ledger.stage("plan"):
-            measure = measure_scene(self.capture, protocol, self.body)
-            config, left_out = _planned(request, measure)
+        with scene.train.preload() as preloading:  # beside planning and compiling
+            with self.ledger.stage("plan"):
+                measure = measure_scene(self.capture, protocol, self.body)
+                config, left_out = _planned(request, measure)
+            with self.ledger.stage("compile"):
+                method: Method = registry.load("method", request.method)(config)
+                warm_up(request.device)
+            with self.ledger.stage("load"):
+                preloading.wait()
         with self.ledger.stage("visibility"):
             self.scorer = Scorer.build(scene, self.body)
         self.describe(
@@ -182,9 +186,6 @@ class _Run(RecordedRun):
             hidden_share=scene.hiding.hidden_share(),
         )
         self.folder.set_status("running", ledger=self.ledger)
-        with self.ledger.stage("compile"):
-            method: Method = registry.load("method", request.method)(config)
-            warm_up(request.device)
         training = TrainingSet(scene.train, self.body, protocol.image.background, self.capture.name)
         with self.ledger.stage("fit"):
             avatar = method.fit(

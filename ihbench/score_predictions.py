@@ -94,7 +94,7 @@ class _ScoreRun(RecordedRun):
 
     def work(self) -> None:
         with self.ledger.stage("load"):
-            self.scene.train.preload()
+            self.scene.train.preload().wait()
         with self.ledger.stage("visibility"):
             scorer = Scorer.build(self.scene, self.body)
         with self.ledger.stage("score"):

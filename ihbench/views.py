@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from threading import Lock
 from typing import Any, TypeVar
@@ -29,11 +29,15 @@ MAX_HELD = 700  # views kept in memory: 512² training views of this many take a
 
 
 class LazyViews(Sequence[View]):
-    """A sequence whose items are made on first use and kept, at most `held` of them (the oldest goes first)."""
+    """A sequence whose items are made on first use and kept, at most `held` of them (the oldest goes first).
+
+    Safe from any number of threads; an item that one of them is making is not made again by another.
+    """
 
     def __init__(self, make: Callable[[int], View], length: int, held: int = MAX_HELD):
         self._make, self._length, self._held = make, length, held
         self._kept: OrderedDict[int, View] = OrderedDict()
+        self._coming: dict[int, Future[View]] = {}
         self._lock = Lock()
 
     def __len__(self) -> int:
@@ -49,18 +53,50 @@ class LazyViews(Sequence[View]):
             if index in self._kept:
                 self._kept.move_to_end(index)
                 return self._kept[index]
-        view = self._make(index)
+            coming = self._coming.get(index)
+            if coming is None:
+                own = self._coming[index] = Future()
+        if coming is not None:
+            return coming.result()
+        try:
+            view = self._make(index)
+        except BaseException as error:
+            with self._lock:
+                del self._coming[index]
+            own.set_exception(error)
+            raise
         with self._lock:
             self._kept[index] = view
             while len(self._kept) > self._held:
                 self._kept.popitem(last=False)
+            del self._coming[index]
+        own.set_result(view)
         return view
 
-    def preload(self, workers: int = 2) -> None:
-        """Make the first `held` items now, on several threads (image decoding releases the interpreter lock)."""
-        with ThreadPoolExecutor(workers) as pool:
-            for _ in pool.map(self.__getitem__, range(min(self._length, self._held))):
-                pass
+    def preload(self, workers: int = 2) -> Preloading:
+        """Begin to make the first `held` items, in order, on threads of their own (image decoding releases the
+        interpreter lock). What cannot be made is left to whoever asks for it, who gets the error."""
+        return Preloading(self, min(self._length, self._held), workers)
+
+
+class Preloading:
+    """Items being made in the background. As a context it ends with what has been begun; `wait` waits for all."""
+
+    def __init__(self, views: LazyViews, count: int, workers: int):
+        self._pool = ThreadPoolExecutor(workers, thread_name_prefix="preload")
+        self._futures = [self._pool.submit(views.__getitem__, index) for index in range(count)]
+
+    def wait(self) -> None:
+        """Wait for all of them, and raise what went wrong with the first that failed."""
+        for future in self._futures:
+            future.result()
+        self._pool.shutdown()
+
+    def __enter__(self) -> Preloading:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._pool.shutdown(wait=True, cancel_futures=True)
 
 
 @dataclass(frozen=True)

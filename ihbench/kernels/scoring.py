@@ -43,7 +43,7 @@ def score_rows(repeats: int, views: int = VIEWS, profile: str = PROFILE) -> list
     rows = []
     with TemporaryDirectory() as name:
         folder = Path(name)
-        scene.train.preload()
+        scene.train.preload().wait()
         for index in indices:
             off = np.roll(scene.test[index].image, 1, axis=1)
             write_png(folder / "in" / f"{index}.png", rounded(off))

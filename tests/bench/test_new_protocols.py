@@ -10,7 +10,7 @@ import pytest
 from ihbench.body import load_body
 from ihbench.cli import main
 from ihbench.contact_sheet import write_png
-from ihbench.data_source import locate
+from ihbench.data_source import body_file, locate
 from ihbench.datasets import plain_scene
 from ihbench.errors import BadInput
 from ihbench.progress import Progress
@@ -167,3 +167,40 @@ def test_what_is_handed_out_can_be_drawn_and_scored(bench, tmp_path):
     )
     assert again.status == 2
     assert "is there already" in again.err
+
+
+@pytest.mark.parametrize(
+    ("files", "gender", "chosen"),
+    [
+        (["SMPL_FEMALE.pkl", "SMPL_MALE.pkl", "SMPL_NEUTRAL.pkl"], "female", "SMPL_FEMALE.pkl"),
+        (["SMPL_MALE.pkl", "SMPL_NEUTRAL.pkl"], "female", "SMPL_NEUTRAL.pkl"),
+        (["basicModel_f_lbs_10_207_0_v1.0.0.pkl", "basicmodel_m_lbs_10_207_0_v1.0.0.pkl"], "male", "basicmodel_m"),
+        (["notes.txt"], "male", None),
+    ],
+)
+def test_a_folder_of_body_files_has_one_for_each_gender(tmp_path, files, gender, chosen):
+    for name in files:
+        (tmp_path / name).write_bytes(b"")
+    if chosen is None:
+        with pytest.raises(BadInput, match=r"expected SMPL_MALE\.pkl"):
+            body_file(tmp_path, gender)
+    else:
+        assert body_file(tmp_path, gender).name.startswith(chosen)
+    assert body_file(tmp_path / files[0], gender) == tmp_path / files[0]
+
+
+def test_a_large_capture_opens_without_decoding_an_image(tmp_path, monkeypatch):
+    """646 frames of 23 cameras: headers only, whatever the number of images."""
+    from ihbench.datasets import pictures, zju_mocap
+    from ihbench.datasets.layouts import ZJU_MOCAP
+
+    folder = tmp_path / "CoreView_386"
+    cameras = [a_camera(0.27 * k) for k in range(23)]
+    zju_mocap.write_annots(folder, cameras, zju_mocap.standard_image_paths(23, 646))
+    (folder / "new_params").mkdir()
+    read = []
+    monkeypatch.setattr(pictures, "opened", lambda path: read.append(path))
+    capture = ZJU_MOCAP(tmp_path).open("386")
+    assert (capture.n_frames, len(capture.camera_ids)) == (646, 23)
+    assert capture.image_path(22, 645).name == "000645.jpg"
+    assert read == []

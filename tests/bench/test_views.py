@@ -323,7 +323,7 @@ def test_lazy_views_hold_no_more_than_they_may_and_drop_the_oldest():
     assert made == [0, 1, 2, 3]
     views[1]
     assert made == [0, 1, 2, 3, 1]
-    views.preload()
+    views.preload().wait()
     assert len(views._kept) == 3
 
 
@@ -348,8 +348,43 @@ def test_lazy_views_from_many_threads():
 
 def test_preload_makes_everything_that_fits():
     made = []
-    LazyViews(made.append, 9, held=6).preload(workers=3)
+    LazyViews(made.append, 9, held=6).preload(workers=3).wait()
     assert sorted(made) == [0, 1, 2, 3, 4, 5]
+
+
+def test_preload_returns_at_once_and_nothing_is_made_twice():
+    go, made = threading.Event(), []
+
+    def make(k):
+        assert go.wait(20)
+        made.append(k)
+        return -k
+
+    views = LazyViews(make, 6)
+    with views.preload(workers=2) as preloading:
+        asking = ThreadPoolExecutor(1).submit(lambda: views[0])  # while another thread makes it
+        assert made == []
+        go.set()
+        preloading.wait()
+        assert asking.result() == 0
+    assert sorted(made) == [0, 1, 2, 3, 4, 5]
+
+
+def test_what_cannot_be_made_is_an_error_for_whoever_asks_and_is_tried_again():
+    broken = {3}
+
+    def make(k):
+        if k in broken:
+            raise BadInput(f"frame {k}")
+        return k
+
+    views = LazyViews(make, 5)
+    with views.preload() as preloading, pytest.raises(BadInput, match="frame 3"):
+        preloading.wait()
+    with pytest.raises(BadInput, match="frame 3"):
+        views[3]
+    broken.clear()
+    assert [*views] == [0, 1, 2, 3, 4]
 
 
 # ------------------------------------------------------------------------------------------- hidden fraction
