@@ -98,11 +98,6 @@ class SnapshotFolder(CaptureFolder):
         words = re.split(r"[^a-z]+", self.name.lower())
         return next((word for word in words if word in ("female", "male")), "neutral")
 
-    @property
-    def has_body(self) -> bool:
-        """Whether `model` can be read without an error about a body that was not given."""
-        return self._given_body is not None or bool(self._mark)
-
     def check_source(self, source: str) -> None:
         """Raise `BadInput` for another silhouette source than "mask"."""
         if source != "mask":
@@ -159,7 +154,7 @@ class PeopleSnapshotCapture(SnapshotFolder):
         Taken over the frames where the two differ most, since a body that stands still fits either way.
         """
         surplus = self.n_poses - self.n_masks
-        if surplus <= 0 or not self.has_body:
+        if surplus <= 0 or not self.has_model:
             return {}
         pose, trans, _ = self._poses
         candidates = np.unique(np.linspace(0, self.n_frames - 1, 64).astype(int))
@@ -600,7 +595,7 @@ def sample_frames(capture: Any, frames: Sequence[int], samples: int, found: dict
             sizes.add((width, height))
             silhouette = capture.silhouette(0, frame)
             decoded += 1
-            if capture.has_body:
+            if capture.has_model:
                 points = capture.camera(0).project(capture.model.pose(capture.body_pose(frame)))
                 overlaps.append(overlap_of(points, silhouette))
         except BadInput as error:

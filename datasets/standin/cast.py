@@ -5,11 +5,31 @@ from __future__ import annotations
 from pathlib import Path
 
 from ihbench import atomic
-from ihbench.body import Body
+from ihbench.body import Body, load_body
+from ihbench.datasets.standin.subject import Subject
 from ihbench.datasets.standin_mark import STANDIN_FILE
 from ihbench.errors import BadInput
 
 NAME_PREFIX = "standin-"
+
+
+def cast_names(count: int) -> list[str]:
+    """The names of the first `count` people of a cast."""
+    return [f"{NAME_PREFIX}{number}" for number in range(1, count + 1)]
+
+
+def open_cast(root: Path, version: int, seed: int, subjects: list[str]) -> tuple[Path, list[Subject]]:
+    """The folder, marked as this cast's, and the people asked for.
+
+    Raises `BadInput` for an unknown subject, a negative seed, and a folder that holds something else.
+    """
+    root = Path(root).expanduser()
+    if seed < 0:
+        raise BadInput(f"stand-in seed {seed}: expected 0 or more")
+    numbers = [member_number(subject) for subject in subjects]
+    body = load_body()
+    claim(root, version, seed, body)
+    return root, [Subject(seed, number, body) for number in numbers]
 
 
 def member_number(subject: str) -> int:

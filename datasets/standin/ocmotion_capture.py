@@ -15,17 +15,15 @@ from pathlib import Path
 import numpy as np
 
 from ihbench import atomic
-from ihbench.body import load_body
 from ihbench.camera import Camera, look_at
 from ihbench.datasets import ocmotion_w2a
 from ihbench.datasets.pictures import encoded
 from ihbench.datasets.standin import motion
-from ihbench.datasets.standin.cast import NAME_PREFIX, claim, member_number
+from ihbench.datasets.standin.cast import cast_names, open_cast
 from ihbench.datasets.standin.furniture import furnish, furniture_view
 from ihbench.datasets.standin.photograph import photograph
 from ihbench.datasets.standin.studio import empty_studio
 from ihbench.datasets.standin.subject import Subject
-from ihbench.errors import BadInput
 from ihbench.progress import Progress
 
 VERSION = 1  # of the generator; a change that moves a pixel raises it
@@ -45,7 +43,7 @@ class OcMotionStandIn:
     @staticmethod
     def subjects(count: int = 6) -> list[str]:
         """The names of the first `count` people of a cast."""
-        return [f"{NAME_PREFIX}{number}" for number in range(1, count + 1)]
+        return cast_names(count)
 
     @staticmethod
     def ensure(
@@ -59,15 +57,10 @@ class OcMotionStandIn:
 
         Raises `BadInput` for an unknown subject and when `root` holds something else.
         """
-        root = Path(root).expanduser()
-        if seed < 0:
-            raise BadInput(f"stand-in seed {seed}: expected 0 or more")
-        numbers = [member_number(subject) for subject in subjects]
-        body = load_body()
-        claim(root, VERSION, seed, body)
+        root, people = open_cast(root, VERSION, seed, subjects)
         progress = progress or Progress.silent()
-        for name, number in zip(subjects, numbers, strict=True):
-            _ensure_sequence(root / name, name, Subject(seed, number, body), progress)
+        for name, person in zip(subjects, people, strict=True):
+            _ensure_sequence(root / name, name, person, progress)
         return root
 
 

@@ -15,17 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench import atomic
-from ihbench.body import load_body
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera, look_at
 from ihbench.datasets import people_snapshot
 from ihbench.datasets.pictures import encoded
 from ihbench.datasets.standin import motion
-from ihbench.datasets.standin.cast import NAME_PREFIX, claim, member_number
+from ihbench.datasets.standin.cast import cast_names, open_cast
 from ihbench.datasets.standin.photograph import Photograph, photograph
 from ihbench.datasets.standin.studio import empty_studio
 from ihbench.datasets.standin.subject import Subject
-from ihbench.errors import BadInput
 from ihbench.progress import Progress
 from ihbench.scene import BodyPose
 
@@ -46,7 +44,7 @@ class PeopleSnapshotStandIn:
     @staticmethod
     def subjects(count: int = 4) -> list[str]:
         """The names of the first `count` people of a cast."""
-        return [f"{NAME_PREFIX}{number}" for number in range(1, count + 1)]
+        return cast_names(count)
 
     @staticmethod
     def ensure(
@@ -60,16 +58,11 @@ class PeopleSnapshotStandIn:
 
         Raises `BadInput` for an unknown subject and when `root` holds something else.
         """
-        root = Path(root).expanduser()
-        if seed < 0:
-            raise BadInput(f"stand-in seed {seed}: expected 0 or more")
-        numbers = [member_number(subject) for subject in subjects]
-        body = load_body()
-        claim(root, VERSION, seed, body)
+        root, people = open_cast(root, VERSION, seed, subjects)
         progress = progress or Progress.silent()
-        for name, number in zip(subjects, numbers, strict=True):
+        for name, person in zip(subjects, people, strict=True):
             if not (root / name / "reconstructed_poses.hdf5").is_file():  # is written last
-                _write_subject(root / name, name, Subject(seed, number, body), progress)
+                _write_subject(root / name, name, person, progress)
         return root
 
 

@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench.body import load_body
 from ihbench.datasets import zju_mocap
-from ihbench.datasets.standin.cast import NAME_PREFIX, claim, member_number
+from ihbench.datasets.standin.cast import cast_names, open_cast
 from ihbench.datasets.standin.motion import N_FRAMES, NOVEL_FRAMES
 from ihbench.datasets.standin.photograph import photograph
 from ihbench.datasets.standin.rig import N_CAMERAS
@@ -37,7 +36,7 @@ class ZjuStandIn:
     @staticmethod
     def subjects(count: int = 6) -> list[str]:
         """The names of the first `count` people of a cast."""
-        return [f"{NAME_PREFIX}{number}" for number in range(1, count + 1)]
+        return cast_names(count)
 
     @staticmethod
     def ensure(
@@ -53,23 +52,12 @@ class ZjuStandIn:
         masks and vertices are written for the wanted frames only. Interrupted, the same call goes on where it
         stopped. Raises `BadInput` for an unknown subject, camera or frame, and when `root` holds something else.
         """
-        root = Path(root).expanduser()
-        if seed < 0:
-            raise BadInput(f"stand-in seed {seed}: expected 0 or more")
-        numbers = [member_number(subject) for subject in subjects]
         frames_of = {camera: sorted(set(frames)) for camera, frames in sorted(wanted.items())}
         _check_wanted(frames_of)
-        body = load_body()
-        claim(root, VERSION, seed, body)
+        root, people = open_cast(root, VERSION, seed, subjects)
         progress = progress or Progress.silent()
-        for name, number in zip(subjects, numbers, strict=True):
-            _ensure_subject(
-                root / f"{zju_mocap.FOLDER_PREFIX}{name}",
-                name,
-                Subject(seed, number, body),
-                frames_of,
-                progress,
-            )
+        for name, person in zip(subjects, people, strict=True):
+            _ensure_subject(root / f"{zju_mocap.FOLDER_PREFIX}{name}", name, person, frames_of, progress)
         return root
 
 
