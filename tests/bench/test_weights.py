@@ -94,7 +94,9 @@ class Attack:
         return (Path.write_text, (Path("pwned"), "x"))
 
 
-@pytest.mark.parametrize("content", [{"features.0.weight": torch.zeros(2)}, {"a": Attack()}, [1, 2]], ids=["tensors", "attack", "list"])
+@pytest.mark.parametrize(
+    "content", [{"features.0.weight": torch.zeros(2)}, {"a": Attack()}, [1, 2]], ids=["tensors", "attack", "list"]
+)
 def test_another_architecture_or_a_pickle_that_would_run_code_is_refused(folder, monkeypatch, content, tmp_path):
     monkeypatch.chdir(tmp_path)
     path = folder / weights.FILES[SQUEEZE].file
