@@ -53,9 +53,9 @@ class LazyViews(Sequence[View]):
             if index in self._kept:
                 self._kept.move_to_end(index)
                 return self._kept[index]
-            coming = self._coming.get(index)
+            coming, own = self._coming.get(index), Future()
             if coming is None:
-                own = self._coming[index] = Future()
+                self._coming[index] = own
         if coming is not None:
             return coming.result()
         try:
