@@ -12,7 +12,7 @@ from ihbench.predictions import Predictions, find_predictions
 from ihbench.progress import Progress
 from ihbench.protocol import Protocol
 from ihbench.recorded_run import RecordedRun, about_scene, recorded
-from ihbench.results import RunResult
+from ihbench.results import RunResult, read_result
 from ihbench.score_stage import ScoreStage
 from ihbench.scoring import Scorer
 from ihbench.store import RunFolder, RunIdentity
@@ -68,13 +68,20 @@ def score_scene(request: ScoreRequest, source: DataSource, scene: str, progress:
         "changed": [],
         "left_out": [],
     }
-    return recorded(
+    result = recorded(
         request.runs,
         identity,
         about,
         request.force,
         lambda folder: _ScoreRun(request, found, opened, body, folder, progress),
     )
+    if result.record["about"]["predictions"] == about["predictions"]:
+        return result
+    folder = RunFolder.open(result.folder)  # the same images were scored before, beside other stray files
+    with folder.lock():
+        folder.record["about"]["predictions"] = about["predictions"]
+        folder.save()
+    return read_result(result.folder)
 
 
 class _ScoreRun(RecordedRun):

@@ -174,3 +174,15 @@ def test_a_pickled_array_is_refused(tmp_path):
     np.save(tmp_path / "p.npy", np.array([{"a": 1}], object), allow_pickle=True)
     with pytest.raises(BadInput, match="plain numpy array"):
         read_image(tmp_path / "p.npy", WHITE)
+
+
+def test_a_run_that_is_found_again_says_what_is_surplus_now(bench, truths):
+    asked = lambda: json.loads(score(bench, truths, "--json").out)["runs"][0]  # noqa: E731
+    first, some = asked(), sorted(truths.rglob("*.png"))[0]
+    stray = truths / "left behind.png"
+    shutil.copy(some, stray)
+    again = asked()
+    assert again["folder"] == first["folder"]  # nothing was scored anew
+    assert (first["predictions"]["surplus"], again["predictions"]["surplus"]) == ([], ["left behind.png"])
+    stray.unlink()
+    assert asked()["predictions"]["surplus"] == []
