@@ -16,6 +16,7 @@ Source: boycehbz/CHOMP vis_OcMotion.py. What the `_w2a` sequences share with thi
 from __future__ import annotations
 
 import hashlib
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -50,7 +51,7 @@ LARGEST_ROTATION = 4 * np.pi  # rad of one joint; a fit may wind once around, de
 LISTED_PROBLEMS = 5  # of one kind, then "and so on"
 
 
-class OneCameraCapture(CaptureFolder):
+class OneCameraCapture(CaptureFolder, ABC):
     """A person before one fixed camera, one image and one visible mask a frame. Keeps no images."""
 
     dataset = "ocmotion"
@@ -67,8 +68,8 @@ class OneCameraCapture(CaptureFolder):
         self.check_index(camera, 0)
         return Camera.from_opencv(self._K, self._E[:3, :3], self._E[:3, 3], *self._image_size)
 
-    def body_pose(self, frame: int) -> BodyPose:
-        raise NotImplementedError
+    @abstractmethod
+    def body_pose(self, frame: int) -> BodyPose: ...
 
     def vertices(self, frame: int) -> Array:
         """[V, 3] m, world: the posed body. Needs the body model."""

@@ -37,6 +37,7 @@ class OcMotionStandIn:
     """Makes sequences of procedural people. A file depends on (VERSION, seed, subject, frame) only."""
 
     version = VERSION
+    protocol = "ocmotion_visible"  # what it is made for
     n_frames = N_FRAMES
     n_cameras = 1
 

@@ -38,6 +38,7 @@ class PeopleSnapshotStandIn:
     """Makes captures of procedural people. A file depends on (VERSION, seed, subject) only."""
 
     version = VERSION
+    protocol = "people_snapshot_occ"  # what it is made for
     n_frames = N_FRAMES
     n_cameras = 1
 

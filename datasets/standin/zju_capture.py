@@ -30,6 +30,7 @@ class ZjuStandIn:
     """Makes captures of procedural people. A file depends on (VERSION, seed, subject, camera, frame) only."""
 
     version = VERSION
+    protocol = "zju_occ"  # what it is made for
     n_frames = ALL_FRAMES
     n_cameras = N_CAMERAS
 

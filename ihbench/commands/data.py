@@ -14,8 +14,6 @@ from ihbench import registry
 from ihbench.commands.parse import options
 from ihbench.errors import BadInput
 
-FIRST = {"zju_mocap": "zju_occ", "people_snapshot": "people_snapshot_occ", "ocmotion": "ocmotion_visible"}
-
 
 @dataclass(frozen=True)
 class Check:
@@ -44,7 +42,7 @@ class Standin:
     subjects: int = 1
     """How many people."""
     protocol: str | None = None
-    """Which images: those that this protocol reads; by default the first protocol on that data set."""
+    """Which images: those that this protocol reads; by default the one that the stand-in is made for."""
     profile: str = "paper"
     """Profile of that protocol."""
 
@@ -105,14 +103,10 @@ def _standin(chosen: Standin) -> int:
 
     if chosen.subjects < 1:
         raise BadInput(f"--subjects {chosen.subjects}: expected 1 or more")
-    registry.entry_point("stand-in", chosen.dataset)
-    name = chosen.protocol or FIRST.get(chosen.dataset)
-    if name is None:
-        raise BadInput(f"--protocol: {chosen.dataset!r} is no data set of the bench's own; name one of its protocols")
-    protocol = load_protocol(name, chosen.profile)
+    standin = registry.load("stand-in", chosen.dataset)
+    protocol = load_protocol(chosen.protocol or standin.protocol, chosen.profile)
     if protocol.dataset != chosen.dataset:
         raise BadInput(f"protocol {protocol.name} is about {protocol.dataset!r}, not {chosen.dataset!r}")
-    standin = registry.load("stand-in", chosen.dataset)
     names = standin.subjects(chosen.subjects)
     standin.ensure(chosen.out, chosen.seed, names, wanted_frames(protocol, standin), Progress())
     print(f"{', '.join(names)} (seed {chosen.seed}) written to {chosen.out}; run with --data {chosen.out}")

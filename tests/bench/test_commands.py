@@ -202,10 +202,11 @@ def test_a_stand_in_written_on_request_passes_the_check_and_runs(bench, tmp_path
     assert outcome.out.splitlines() == [
         f"standin-1 (seed 3) written to {tmp_path / 'cast'}; run with --data {tmp_path / 'cast'}"
     ]
-    check = bench("data", "check", tmp_path / "cast", "--json")
+    words_of_check = ["data", "check", tmp_path / "cast", "--overlays", tmp_path / "seen"]
+    check = bench(*words_of_check, "--json")
     told = json.loads(check.out)
     assert (check.status, told["ok"], told["standin"]) == (0, True, "stand-in v2 seed 3")
-    assert "standin: stand-in v2 seed 3" in bench("data", "check", tmp_path / "cast").out
+    assert "standin: stand-in v2 seed 3" in bench(*words_of_check).out
     run = bench.run(*words, "--data", tmp_path / "cast", method=mannequin)
     assert run.status == 0
     assert "**stand-in v2 seed 3**" in run.out
@@ -217,7 +218,7 @@ def test_data_check_names_what_is_wrong_and_returns_1(bench, tmp_path):
     picture = copy / "CoreView_standin-2" / "Camera_B1" / "000000.jpg"
     picture.write_bytes(picture.read_bytes()[:3000])
     before = contents(copy)
-    outcome = bench("data", "check", copy)
+    outcome = bench("data", "check", copy, "--overlays", tmp_path / "seen")
     assert outcome.status == 1
     assert f"{picture}: damaged or cut short" in outcome.out
     assert contents(copy) == before
