@@ -7,7 +7,7 @@ import os
 import sys
 from importlib import import_module
 
-from ihbench import __version__
+from ihbench import __version__, registry
 from ihbench.errors import BadInput
 
 COMMANDS = {
@@ -33,7 +33,8 @@ def usage() -> str:
         "usage: ihbench COMMAND [options]        ihbench COMMAND --help shows its options",
         "",
     ]
-    lines += [f"  {name:<10}{what}" for name, what in COMMANDS.items()]
+    lines += [f"  {name:<11}{what}" for name, what in COMMANDS.items()]
+    lines += [f"  {name:<11}{registry.load('command', name).SUMMARY}" for name in registry.names("command")]
     lines += [
         "",
         "start here: ihbench run --protocol zju_occ --scene standin-1",
@@ -61,11 +62,12 @@ def main(argv: list[str] | None = None) -> int:
         return 0
     as_json = "--json" in argv
     try:
-        if argv[0] not in COMMANDS:
-            from ihbench.registry import nearest
-
-            raise BadInput(f"unknown command {argv[0]!r}: {nearest(argv[0], list(COMMANDS))}")
-        return import_module(f"ihbench.commands.{argv[0]}").main(argv[1:])
+        if argv[0] in COMMANDS:
+            return import_module(f"ihbench.commands.{argv[0]}").main(argv[1:])
+        added = registry.names("command")  # by methods and by other packages
+        if argv[0] not in added:
+            raise BadInput(f"unknown command {argv[0]!r}: {registry.nearest(argv[0], [*COMMANDS, *added])}")
+        return registry.load("command", argv[0]).main(argv[1:])
     except BadInput as error:
         print(f"ihbench: {error}", file=sys.stderr)
         if as_json:

@@ -20,6 +20,8 @@ GROUPS = {
     "dataset": "ihbench.datasets",
     "stand-in": "ihbench.standins",
     "training layout": "ihbench.training_layouts",
+    "people": "ihbench.people",
+    "command": "ihbench.commands",
     "protocol": "ihbench.protocols",
     "occlusion": "ihbench.occlusions",
     "report": "ihbench.reports",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ihbench import __version__, registry
 from ihbench.capture_digest import capture_digest
+from ihbench.config_fields import flat, with_fields
 from ihbench.data_source import DataSource, locate
 from ihbench.errors import BadInput
 from ihbench.metrics import mean_over_frames
@@ -35,6 +36,7 @@ from ihbench.views import OccludedScene, open_scene
 if TYPE_CHECKING:
     from ihbench.body import Body
 
+ENDS = 1 << 16  # bytes
 CURVE_VIEWS = 6  # test views on which the quality-time curve is measured
 
 
@@ -104,11 +106,11 @@ def configuration(method: str, profile: str, switches: dict[str, Any]) -> Any:
     if profile not in profiles:
         raise BadInput(f"method {method!r}: unknown profile {profile!r}: {registry.nearest(profile, list(profiles))}")
     config = profiles[profile]
-    known = [field.name for field in fields(config)]
+    known = [*flat(config), *(field.name for field in fields(config))]
     for name in switches:
         if name not in known:
             raise BadInput(f"method {method!r}: unknown switch {name!r}: {registry.nearest(name, known)}")
-    return replace(config, **switches)
+    return with_fields(config, switches)
 
 
 def run_scene(request: RunRequest, source: DataSource, scene: str, progress: Progress) -> RunResult:
@@ -134,7 +136,7 @@ def run_identity(request: RunRequest, capture: Capture, body: Body) -> RunIdenti
         scene=capture.name,
         data=f"{capture.standin or capture.variant} {capture_digest(capture, request.protocol)}",
         method=request.method,
-        config={**asdict(request.config), "keep": list(request.keep)},
+        config={**asdict(request.config), "keep": list(request.keep), **_outside(request)},
         profile=request.protocol.profile,
         seed=request.seed,
         body=body.content_sha(),
@@ -220,23 +222,39 @@ def _planned(request: RunRequest, measure: SceneMeasure) -> tuple[Any, list[Omis
         return request.config, left_out
     proposed = [o for o in registry.load("config", request.method).leave_out(request.config, measure)]
     proposed = [o for o in proposed if o.field not in request.keep]
-    return replace(request.config, **{o.field: o.value for o in proposed}), proposed + left_out
+    return with_fields(request.config, {o.field: o.value for o in proposed}), proposed + left_out
 
 
 def _changed(request: RunRequest) -> list[str]:
     """Switches that differ from the profile, and the protocol's occlusion if it was replaced, for table rows."""
-    base = registry.load("config", request.method).PROFILES[request.protocol.profile]
-    changed = [
-        f"{field.name}={getattr(request.config, field.name)}"
-        for field in fields(base)
-        if getattr(request.config, field.name) != getattr(base, field.name)
-    ]
+    base = flat(registry.load("config", request.method).PROFILES[request.protocol.profile])
+    changed = [f"{name}={value}" for name, value in flat(request.config).items() if value != base[name]]
     return [*changed, f"keep={','.join(request.keep)}"] if request.keep else changed
 
 
 def _source_digest(package: Path) -> str:
-    """Hash of a method's own source files: edited code is another run."""
+    """Hash of a method's own source files and shipped weights: edited code is another run."""
     digest = hashlib.sha256()
-    for path in sorted(package.rglob("*.py")):
+    files = [path for ending in ("*.py", "*.safetensors") for path in package.rglob(ending)]
+    for path in sorted(files):
         digest.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:8]
+
+
+def _outside(request: RunRequest) -> dict[str, str]:
+    """A hash of files outside the package that the configuration names, such as weights: same path, other content is
+    another run. A method's config module lists them as `outside_files(config)`; it may have none."""
+    named = getattr(registry.load("config", request.method), "outside_files", None)
+    found = [] if named is None else named(request.config)
+    if not found:
+        return {}
+    digest = hashlib.sha256()
+    for folder in found:
+        for path in sorted(p for p in Path(folder).rglob("*") if p.is_file()):
+            size = path.stat().st_size
+            with path.open("rb") as file:  # both ends: whole weights of gigabytes would take minutes
+                ends = file.read(ENDS)
+                file.seek(max(size - ENDS, 0))
+                ends += file.read(ENDS)
+            digest.update(f"{path.relative_to(folder).as_posix()}\0{size}\0".encode() + ends)
+    return {"outside": digest.hexdigest()[:8]}

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from ihbench.calibration import DESCRIPTIONS, ROWS
 from ihbench.metrics import Identity, Mean, macro_mean
 from ihbench.metrics.identity import metric_of
+from ihbench.reports.inpainting import inpainting_section, stage_lines
 from ihbench.reports.significance import intervals_section
 from ihbench.results import RunResult
 
@@ -49,6 +50,8 @@ def _group(key: tuple[str, str, str, str], runs: list[RunResult], presets: Seque
     lines += [f"`{name}`" for name in _without_regions(identities)]
     lines += [f"- {row}: {DESCRIPTIONS[row]}" for row in ROWS if any(row in run.rows for run in done)]
     lines += _remarks(done)
+    lines += stage_lines(done)
+    lines += inpainting_section(_labelled(done))
     for preset in presets:
         lines += ["", *_preset(preset, done, headline)]
     lines += intervals_section(_labelled(done), identities, headline)

@@ -96,9 +96,9 @@ def _run(chosen: Any) -> int:
 
 
 def _check_keep(keep: tuple[str, ...], config: Any) -> None:
-    from dataclasses import fields
+    from ihbench.config_fields import flat
 
-    known = [f.name for f in fields(config)]
+    known = list(flat(config))
     for name in keep:
         if name not in known:
             raise BadInput(f"--keep {name}: no such switch: {registry.nearest(name, known)}")

@@ -18,7 +18,7 @@ from ihbench.body.canonical import canonical_pose
 from ihbench.body.uv import chart_padding, texel_table
 from ihbench.camera import Camera
 from ihbench.errors import BadInput
-from ihbench.methods.inpainthuman.config import InpaintHumanConfig
+from ihbench.methods.inpainthuman.config import InpaintHumanConfig, config_from
 from ihbench.methods.inpainthuman.decoder import GaussianDecoder, positional_encoding, scale_factor
 from ihbench.methods.inpainthuman.pose_residual import ResidualEncoder, root_free_position_map
 from ihbench.methods.inpainthuman.uv_features import UVFeatures, bilinear_corners
@@ -229,8 +229,7 @@ class GaussianAvatar(nn.Module):
         if fitted != given:
             raise BadInput(f"{folder}: was fitted on another body ({fitted}) than the one given ({given})")
         try:
-            config = {k: tuple(v) if isinstance(v, list) else v for k, v in words["config"].items()}
-            avatar = cls(InpaintHumanConfig(**config), body, np.array(words["betas"]), seed=0)
+            avatar = cls(config_from(words["config"]), body, np.array(words["betas"]), seed=0)
             avatar.load_state_dict(tensors)
             avatar.residual_on = bool(words["residual_on"])
         except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:

@@ -6,13 +6,17 @@ whose representation the paper builds on.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
 
 from ihbench.errors import BadInput
+from ihbench.methods.inpainthuman.inpainting.inpaint_config import PAPER_INPAINT, QUICK_INPAINT, InpaintConfig
+from ihbench.methods.inpainthuman.refine_config import PAPER_REFINE, QUICK_REFINE, RefineConfig
 from ihbench.plan import Omission, SceneMeasure
 
 STATIC_DEG = 5.0  # below this joint motion nothing depends on the pose
+NOTHING_HIDDEN = 0.002  # share of the texels that no frame shows although one faces them; fewer are specks
 FINEST_LEVEL = 3.0  # a level whose texels are this many times finer than the pixels cannot be told apart by them
 
 
@@ -78,6 +82,10 @@ class InpaintHumanConfig:
     """Leave out Gaussians that the posed body hides before they are decoded. Changes time, hardly the image."""
     paper_strict: bool = False
     """Follow the paper's text where it differs from sensible defaults: no background term, no regularisers."""
+    inpaint: InpaintConfig = field(default_factory=lambda: QUICK_INPAINT)
+    """Stage 2: what no frame shows is painted."""
+    refine: RefineConfig = field(default_factory=lambda: QUICK_REFINE)
+    """Stage 3: the avatar learns from the painted frames."""
 
     def __post_init__(self) -> None:
         rules = (
@@ -111,6 +119,8 @@ PAPER = InpaintHumanConfig(
     lr_decoder=1e-4,
     lr_encoder=1e-4,
     lr_final=1.0,
+    inpaint=PAPER_INPAINT,
+    refine=PAPER_REFINE,
 )
 
 PROFILES = {"quick": QUICK, "paper": PAPER}
@@ -130,4 +140,29 @@ def leave_out(config: InpaintHumanConfig, scene: SceneMeasure) -> list[Omission]
             f"{scene.texel_mm(max(config.levels)):.1f} mm"
         )
         found.append(Omission("levels", useful, reason))
+    inpaint = config.inpaint
+    everything_seen = scene.hidden_texels <= NOTHING_HIDDEN
+    if inpaint.on and everything_seen and inpaint.context == "seen" and not inpaint.turntable:
+        reason = f"of the surface {scene.hidden_texels:.1%} is hidden whenever it faces the camera: nothing to paint"
+        found.append(Omission("inpaint.on", False, reason))
     return found
+
+
+def config_from(words: dict[str, Any]) -> InpaintHumanConfig:
+    """What `dataclasses.asdict` made, back from JSON. Raises `TypeError` for fields that do not exist."""
+    values = {name: tuple(value) if isinstance(value, list) else value for name, value in words.items()}
+    for name, kind in (("inpaint", InpaintConfig), ("refine", RefineConfig)):
+        if name in values:
+            values[name] = kind(**values[name])
+    return InpaintHumanConfig(**values)
+
+
+def outside_files(config: InpaintHumanConfig) -> list[Path]:
+    """Folders whose content affects the answer."""
+    inpaint = config.inpaint
+    if not inpaint.on:
+        return []
+    named = [inpaint.weights, inpaint.control_weights] if inpaint.uses_diffusion else []
+    if inpaint.silhouette == "sam":
+        named.append(inpaint.sam_weights)
+    return [Path(name).expanduser() for name in named if name and Path(name).expanduser().is_dir()]

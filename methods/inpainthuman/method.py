@@ -1,4 +1,4 @@
-"""InpaintHuman as a registered method."""
+"""InpaintHuman as a registered method: fit what is seen, paint what is not, refine on both (sec. 3.4)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ihbench.scene import TrainingSet
 
 
 class InpaintHuman:
-    """Multi-scale UV Gaussians, fitted to the visible pixels (stage 1 of the paper)."""
+    """Multi-scale UV Gaussians fitted to the visible pixels, personalised inpainting of the hidden, refinement."""
 
     def __init__(self, config: InpaintHumanConfig):
         self.config = config
@@ -33,6 +33,16 @@ class InpaintHuman:
             avatar = GaussianAvatar(self.config, training.body, betas, seed).to(device)
         with ledger.stage("fit/stage1"):
             Stage1(avatar, training, seed, ledger).run(progress)
+        if self.config.inpaint.on:
+            # imported here: a run without inpainting must not pay for it
+            from ihbench.methods.inpainthuman.stage2 import Stage2
+            from ihbench.methods.inpainthuman.stage3 import Stage3
+
+            with ledger.stage("fit/stage2"):
+                painted = Stage2(avatar, training, self.config.inpaint, seed, ledger).run(progress)
+            if painted:
+                with ledger.stage("fit/stage3"):
+                    Stage3(avatar, training, painted, seed, ledger, self.config.refine).run(progress)
         return avatar
 
     def load(self, folder: Path, body: Body, device: str = "cpu") -> GaussianAvatar:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,10 +9,9 @@ import torch
 from torch import Tensor
 
 from ihbench.camera import Camera
-from ihbench.errors import BadInput, Diverged
 from ihbench.ledger import Ledger
 from ihbench.methods.inpainthuman.avatar import GaussianAvatar
-from ihbench.progress import Progress
+from ihbench.methods.inpainthuman.optimisation import Optimisation
 from ihbench.render.splat import render_gaussians
 from ihbench.scene import MaskState, TrainingSet, TrainView
 from ihbench.views import LazyViews
@@ -73,126 +71,68 @@ def body_window(camera: Camera, vertices: np.ndarray) -> tuple[int, int, int, in
     return x0, y0, max(x1 - x0, 1), max(y1 - y0, 1)
 
 
-def loss_of(avatar: GaussianAvatar, target: Target, background: tuple[float, float, float]) -> Tensor:
+@dataclass(frozen=True)
+class Drawn:
+    """What the avatar shows of a target, and what it was decoded to."""
+
+    rgb: Tensor  # [h, w, 3]
+    offset: Tensor  # [n, 3] m
+    scale: Tensor  # [n] m
+
+
+def draw(avatar: GaussianAvatar, target: Target, background: tuple[float, float, float]) -> Drawn:
+    """Decode, pose and splat the points of a target. Differentiable in the avatar's parameters."""
+    offset, scale, color = avatar.decode(target.points, target.position_map)
+    means = avatar.pose_points(target.points, offset, target.transforms)
+    return Drawn(render_gaussians(means, scale, color, target.camera, background)[0], offset, scale)
+
+
+def initial_loss(avatar: GaussianAvatar, drawn: Drawn, target: Target) -> Tensor:
     """Mean L1 over visible person pixels, plus what the config adds to it. Unknown pixels never count.
 
     Both L1 terms are divided by the number of visible pixels, so a spill of one pixel into known background weighs
     as much as one wrong person pixel, whatever the window's size.
     """
     config = avatar.config
-    offset, scale, color = avatar.decode(target.points, target.position_map)
-    means = avatar.pose_points(target.points, offset, target.transforms)
-    rgb, _ = render_gaussians(means, scale, color, target.camera, background)
-    error = (rgb - target.image).abs()
+    error = (drawn.rgb - target.image).abs()
     visible = target.person.sum().clamp(min=1) * 3
     loss = (error * target.person).sum() / visible
     if config.paper_strict:
         return loss
     loss = loss + config.background_weight * (error * target.background).sum() / visible
-    n = max(len(offset), 1)  # a body behind the camera leaves no point
+    n = max(len(drawn.offset), 1)  # a body behind the camera leaves no point
     return (
         loss
-        + config.offset_weight * offset.square().sum() / (3 * n)
-        + config.scale_weight * scale.sum() / n
+        + config.offset_weight * drawn.offset.square().sum() / (3 * n)
+        + config.scale_weight * drawn.scale.sum() / n
         + config.feature_weight * avatar.features.table.square().mean()
     )
 
 
-class Stage1:
+def loss_of(avatar: GaussianAvatar, target: Target, background: tuple[float, float, float]) -> Tensor:
+    """`initial_loss` of what the avatar shows of a target."""
+    return initial_loss(avatar, draw(avatar, target, background), target)
+
+
+class Stage1(Optimisation):
     """The optimisation, step by step, with everything needed to stop after any step and go on later."""
 
+    name, title = STATE, "stage 1"
+
     def __init__(self, avatar: GaussianAvatar, training: TrainingSet, seed: int, ledger: Ledger):
-        self.avatar, self.training, self.seed, self.ledger = avatar, training, seed, ledger
-        config = avatar.config
-        groups = [
-            {"params": list(avatar.features.parameters()), "lr": config.lr_maps, "weight_decay": 0.0},
-            {"params": list(avatar.decoder.parameters()), "lr": config.lr_decoder, "weight_decay": 0.01},
-        ]
-        if config.pose_residual:
-            groups.append(
-                {"params": list(avatar.encoder.parameters()), "lr": config.lr_encoder, "weight_decay": 0.01}
-            )
-        self.rates = [group["lr"] for group in groups]
-        self.optimizer = torch.optim.AdamW(groups, fused=True)
-        self.names = {id(p): name for name, p in avatar.named_parameters()}
-        self.step = 0
         views = training.views
+        super().__init__(avatar, training, seed, ledger, steps=avatar.config.steps, views=len(views))
         self._targets = LazyViews(lambda k: prepare_target(avatar, views[k]), len(views), held=TARGETS_HELD)
 
-    def run(self, progress: Progress) -> None:
-        """Optimise to the last step, resuming a saved state if the ledger has one.
+    def _loss(self, k: int) -> Tensor:
+        return loss_of(self.avatar, self._targets[k], self.training.background)
 
-        Raises `Diverged` at the first non-finite loss or gradient, `BadInput` when no view shows the person.
-        """
-        config, views = self.avatar.config, self.training.views
-        self._require_visible_pixels()
-        self._restore()
-        with progress.task("stage 1", config.steps) as task:
-            task.advance(self.step)
-            while self.step < config.steps:
-                self._one_step(self._view_of(self.step, len(views)))
-                self.step += 1
-                task.advance()
-                self.ledger.offer(self.step, self.avatar)
-                if self.ledger.due_to_save() and self.step < config.steps:
-                    self.save()
-        self.ledger.offer(self.step, self.avatar, force=True)
-        self.save()
+    def _before_step(self) -> None:
+        self._join_residual(self.step)
 
-    def _require_visible_pixels(self) -> None:
-        shows = any((view.mask == MaskState.PERSON).any() for view in self.training.views)
-        if not shows:
-            raise BadInput(
-                f"scene {self.training.name}: no training view shows a visible person pixel; nothing to fit"
-            )
+    def _restored(self) -> None:
+        self._join_residual(self.step - 1)  # as the last step had it
 
-    def _view_of(self, step: int, n: int) -> int:
-        """Every view once an epoch, in an order that depends on seed and epoch alone, so a resumed run repeats it."""
-        epoch, k = divmod(step, n)
-        return int(np.random.default_rng((self.seed, epoch)).permutation(n)[k])
-
-    def _one_step(self, k: int) -> None:
+    def _join_residual(self, step: int) -> None:
         config = self.avatar.config
-        share = self.step / config.steps
-        self.avatar.residual_on = config.pose_residual and share >= config.residual_start
-        decay = config.lr_final + (1 - config.lr_final) * 0.5 * (1 + math.cos(math.pi * share))
-        for group, rate in zip(self.optimizer.param_groups, self.rates, strict=True):
-            group["lr"] = rate * decay
-        self.optimizer.zero_grad(set_to_none=True)
-        loss = loss_of(self.avatar, self._targets[k], self.training.background)
-        if not math.isfinite(loss.item()):
-            raise Diverged(self.step, f"loss is {loss.item()}")
-        loss.backward()
-        for group in self.optimizer.param_groups:
-            norm = torch.nn.utils.clip_grad_norm_(group["params"], config.clip_gradient)
-            if not math.isfinite(norm.item()):
-                raise Diverged(self.step, f"gradient norm is {norm.item()}")
-        self.optimizer.step()
-
-    def save(self) -> None:
-        """Hand parameters, optimiser moments and the step to the ledger."""
-        tensors = {f"avatar.{name}": p.detach() for name, p in self.avatar.named_parameters()}
-        for p, state in self.optimizer.state.items():
-            for key, value in state.items():
-                tensors[f"adam.{self.names[id(p)]}.{key}"] = value
-        self.ledger.save_state(STATE, tensors, {"step": self.step})
-
-    def _restore(self) -> None:
-        saved = self.ledger.load_state(STATE)
-        if saved is None:
-            return
-        tensors, meta = saved
-        with torch.no_grad():
-            for name, p in self.avatar.named_parameters():
-                p.copy_(torch.as_tensor(tensors[f"avatar.{name}"]))
-                state = {
-                    key: torch.as_tensor(tensors[f"adam.{name}.{key}"]).clone()
-                    for key in ("step", "exp_avg", "exp_avg_sq")
-                    if f"adam.{name}.{key}" in tensors
-                }
-                if state:
-                    self.optimizer.state[p] = state
-        self.step = int(meta["step"])
-        config = self.avatar.config
-        self.avatar.residual_on = config.pose_residual and (self.step - 1) / config.steps >= config.residual_start
-        self.ledger.event("resumed", stage=STATE, step=self.step)
+        self.avatar.residual_on = config.pose_residual and step / config.steps >= config.residual_start

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from ihbench import plan
 from ihbench.body import texel_table
+from ihbench.config_fields import flat, with_fields
 from ihbench.methods.inpainthuman.config import PAPER, QUICK, leave_out
 from ihbench.plan import TEXELS, SceneMeasure, absent_regions, expected_seconds, measure_scene
 from ihbench.protocol import REGIONS
@@ -163,13 +164,24 @@ def test_a_far_camera_makes_the_pixels_coarse():
     far = measured(FakeCapture([a_pose(k) for k in range(3)], [a_camera(distance=9.0, size=256)] * 4))
     near = measured(FakeCapture([a_pose(k) for k in range(3)], [a_camera(size=256)] * 4))
     assert far.pixel_mm == pytest.approx(3 * near.pixel_mm, rel=0.02)
-    assert leave_out(QUICK, far)[-1].value == (64,)
+    assert [o.value for o in leave_out(QUICK, far) if o.field == "levels"] == [(64,)]
+
+
+def test_nothing_is_painted_where_every_frame_shows_all(moving):
+    seen = replace(moving, hidden_texels=0.001)
+    (omission,) = [o for o in leave_out(QUICK, seen) if o.field == "inpaint.on"]
+    assert omission.value is False
+    assert "0.1%" in omission.reason
+    assert not [o for o in leave_out(QUICK, replace(moving, hidden_texels=0.02)) if o.field == "inpaint.on"]
+    for needed in ({"turntable": 4}, {"context": "frame"}, {"on": False}):
+        config = replace(QUICK, inpaint=replace(QUICK.inpaint, **needed))
+        assert not [o for o in leave_out(config, seen) if o.field == "inpaint.on"]
 
 
 def test_omissions_name_fields_of_the_configuration(moving):
-    for o in leave_out(QUICK, replace(moving, motion_deg=0.0, pixel_mm=40.0)):
-        assert o.value != getattr(QUICK, o.field)
-        assert getattr(replace(QUICK, **{o.field: o.value}), o.field) == o.value
+    for o in leave_out(QUICK, replace(moving, motion_deg=0.0, pixel_mm=40.0, hidden_texels=0.0)):
+        assert o.value != flat(QUICK)[o.field]
+        assert flat(with_fields(QUICK, {o.field: o.value}))[o.field] == o.value
 
 
 def test_regions_without_a_texel_are_absent_with_a_reason(moving):
@@ -222,4 +234,4 @@ def test_expected_seconds_are_the_median_of_finished_runs_alike(tmp_path):
 def test_a_measure_can_be_made_by_hand():
     """Methods of others build one for their own tests."""
     scene = SceneMeasure(1, 0, 1, 0, 1, 0, 0, motion_deg=0, turn_deg=0, pixel_mm=3, surface_mm=1500, occlusion={})
-    assert [o.field for o in leave_out(QUICK, scene)] == ["pose_residual"]
+    assert [o.field for o in leave_out(QUICK, scene)] == ["pose_residual", "inpaint.on"]

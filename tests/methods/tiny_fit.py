@@ -29,6 +29,7 @@ TINY = replace(
     position_map=32,
     residual_channels=8,
     steps=10,
+    inpaint=replace(QUICK.inpaint, on=False),
 )
 
 

@@ -1,0 +1,112 @@
+"""The album that `mini` learns from: crops of procedural people, kept in files of a hundred people each."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench import atomic, registry
+from ihbench.body import load_body
+from ihbench.errors import BadInput
+from ihbench.methods.inpainthuman.inpainting.part_map import part_labels
+from ihbench.methods.inpainthuman.inpainting.person_crop import PADDING, person_crop
+from ihbench.progress import Progress
+
+PAGE = 100  # people per file
+JITTER = 0.03  # of the body's longer side, by which the padding varies
+
+
+@dataclass(frozen=True)
+class Page:
+    """The crops of a hundred people. `first[k] : first[k + 1]` are person k's."""
+
+    widths: NDArray[np.int64]  # [N] px; crop n is `images[n, :, :widths[n]]`
+    images: NDArray[np.uint8]  # [N, S, S, 3]
+    silhouettes: NDArray[np.bool_]  # [N, S, S]
+    parts: NDArray[np.uint8]  # [N, S, S] SMPL parts
+    person: NDArray[np.int64]  # [N]
+    phrases: list[tuple[str, ...]]  # per person
+    traits: NDArray[np.float32]  # [P, T] per person
+
+
+def make_page(people: str, start: int, count: int, each: int, size: int) -> Page:
+    """Meet `count` people from number `start`, and crop `each` photographs of every one."""
+    meet, body = registry.load("people", people).meet, load_body()
+    found: dict[str, list[Any]] = {name: [] for name in ("widths", "images", "silhouettes", "parts", "person")}
+    phrases, traits = [], []
+    for k in range(count):
+        person = meet(start + k, body, each)
+        rng = np.random.default_rng((start + k, 7))
+        phrases.append(person.phrases)
+        traits.append(person.traits)
+        for shot in person.snapshots:
+            vertices = body.pose(shot.body_pose)
+            padding = PADDING + JITTER * rng.uniform(-1, 1)
+            crop = person_crop(shot.camera, vertices, size, padding=padding)
+            padded = ((0, 0), (0, size - crop.width))
+            labels = part_labels(vertices, body, crop.camera(shot.camera))
+            found["widths"].append(crop.width)
+            found["images"].append(np.pad(crop.cut(shot.image, 255), (*padded, (0, 0))))
+            found["silhouettes"].append(np.pad(crop.cut(shot.silhouette) > 0.5, padded))
+            found["parts"].append(np.pad(labels, padded))
+            found["person"].append(k)
+    arrays = {name: np.array(values) for name, values in found.items()}
+    return Page(**arrays, phrases=phrases, traits=np.array(traits, np.float32))
+
+
+class CropAlbum:
+    """Pages `start / PAGE` onwards of an album in a folder; made when they are missing, each written whole."""
+
+    def __init__(self, folder: Path, people: str, each: int, size: int):
+        self.people, self.each, self.size = people, each, size
+        self.folder = Path(folder) / f"{people}-v{registry.load('people', people).VERSION}-{each}x{size}"
+
+    def path(self, start: int) -> Path:
+        return self.folder / f"{start:08d}.npz"
+
+    def make(self, start: int, count: int, progress: Progress) -> None:
+        """Make sure that people `start` to `start + count` are there. Raises `BadInput` for a partial page."""
+        if start % PAGE or count % PAGE:
+            raise BadInput(f"album: people come in pages of {PAGE}, got {start} and {count}")
+        missing = [s for s in range(start, start + count, PAGE) if not self.path(s).is_file()]
+        if not missing:
+            return
+        with progress.task("photographing people", len(missing) * PAGE) as task:
+            work = [(self.people, s, self.each, self.size, self.path(s)) for s in missing]
+            with ProcessPoolExecutor(min(os.cpu_count() or 1, len(missing))) as pool:
+                for _ in pool.map(_write_page, work):
+                    task.advance(PAGE)
+
+    def pages(self, start: int, count: int) -> Iterator[Page]:
+        for s in range(start, start + count, PAGE):
+            yield _read_page(self.path(s))
+
+
+def _write_page(work: tuple[str, int, int, int, Path]) -> None:
+    people, start, each, size, path = work
+    page = make_page(people, start, PAGE, each, size)
+    words = np.array(["\n".join(phrases) for phrases in page.phrases])
+    buffer = BytesIO()
+    arrays = {name: getattr(page, name) for name in ("widths", "images", "silhouettes", "parts", "person", "traits")}
+    np.savez(buffer, phrases=words, **arrays)
+    atomic.write_bytes(path, buffer.getvalue())
+
+
+def _read_page(path: Path) -> Page:
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            arrays = {name: data[name] for name in data.files}
+    except (OSError, ValueError, KeyError) as error:
+        raise BadInput(
+            f"{path}: not a readable page of an album ({error}); remove it and it is made again"
+        ) from error
+    words = arrays.pop("phrases")
+    return Page(**arrays, phrases=[tuple(str(word).split("\n")) for word in words])

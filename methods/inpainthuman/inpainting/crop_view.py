@@ -1,0 +1,75 @@
+"""A training view cut to the person: what every inpainter is given."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench.body import Body
+from ihbench.camera import Camera
+from ihbench.methods.inpainthuman.inpainting.part_map import NO_PART, part_labels
+from ihbench.methods.inpainthuman.inpainting.person_crop import PersonCrop, person_crop
+from ihbench.progress import Progress
+from ihbench.scene import BodyPose, MaskState, TrainView
+
+EDGE = 1e-6  # share of a crop's pixel above which it counts
+
+
+@dataclass(frozen=True)
+class CropView:
+    """One view at the inpainter's size. A crop's pixel is unknown if any part of it is."""
+
+    index: int  # of the view in the training set
+    image: NDArray[np.uint8]  # [S, W, 3] RGB; unknown pixels show whatever the view is painted with
+    person: NDArray[np.bool_]  # [S, W] known, and mostly visible person
+    unknown: NDArray[np.bool_]  # [S, W]
+    parts: NDArray[np.uint8]  # [S, W] SMPL part of the posed body, 255 off it
+    crop: PersonCrop
+    camera: Camera  # of the crop
+    body_pose: BodyPose
+
+    @property
+    def body(self) -> NDArray[np.bool_]:
+        """[S, W] where the posed body model is."""
+        return self.parts != NO_PART
+
+    @property
+    def hidden_share(self) -> float:
+        """Share of the posed body's pixels that are unknown; 0 for a body that is nowhere in the crop."""
+        body = self.body
+        return float((body & self.unknown).sum() / max(body.sum(), 1))
+
+    def completed(self, painted: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """[S, W, 3]: the original where it is known, `painted` elsewhere."""
+        return np.where(self.unknown[..., None], painted, self.image)
+
+
+def cut_view(view: TrainView, index: int, body: Body, size: int, square: bool = False) -> CropView:
+    """Cut a training view to the padded box of its body, `size` px tall. What lies outside the image counts as known
+    background: nothing can be learned or painted there."""
+    vertices = body.pose(view.body_pose)
+    crop = person_crop(view.camera, vertices, size, square=square)
+    image = crop.cut(view.image, 255)
+    unknown = crop.cut(view.mask == MaskState.UNKNOWN) > EDGE
+    person = crop.cut(view.mask == MaskState.PERSON) >= 0.5
+    camera = crop.camera(view.camera)
+    parts = part_labels(vertices, body, camera)
+    return CropView(index, image, person & ~unknown, unknown, parts, crop, camera, view.body_pose)
+
+
+class Inpainter(Protocol):
+    """Fills the unknown pixels of crops. Deterministic by its own seed."""
+
+    name: str
+
+    def inpaint(self, views: list[CropView], progress: Progress) -> list[NDArray[np.uint8]]:
+        """One completed crop [S, W, 3] per view, equal to the view's image where it is known."""
+        ...
+
+
+def as_shown(view: CropView, image: NDArray[np.uint8]) -> CropView:
+    """The same view with another image, for composites."""
+    return replace(view, image=image)

@@ -1,0 +1,58 @@
+"""Crops as tensors, and the noise that all of them share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ihbench.methods.inpainthuman.inpainting.backbone import Backbone
+from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
+from ihbench.methods.inpainthuman.inpainting.part_map import part_colours
+
+
+@dataclass(frozen=True)
+class DiffusionBatch:
+    """Crops of one width."""
+
+    pixels: Tensor  # [B, 3, H, W] in [-1, 1]
+    unknown: Tensor  # [B, 1, H, W] 1 where the truth is not known
+    person: Tensor  # [B, 1, H, W] 1 where a pixel is known to show the person
+    parts: Tensor  # [B, 3, H, W] part map in [0, 1]
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+
+def batch_of(views: list[CropView], device: torch.device) -> DiffusionBatch:
+    """Views of equal crop size as tensors."""
+    images = np.stack([view.image for view in views])
+    unknown = np.stack([view.unknown for view in views])[:, None]
+    colours = part_colours(np.stack([view.parts for view in views]))
+    return DiffusionBatch(
+        pixels=torch.from_numpy(images).to(device).movedim(-1, 1).float() / 127.5 - 1,
+        unknown=torch.from_numpy(unknown).to(device).float(),
+        person=torch.from_numpy(np.stack([view.person for view in views])[:, None]).to(device).float(),
+        parts=torch.from_numpy(colours).to(device).movedim(-1, 1).float() / 255,
+    )
+
+
+def by_width(views: list[CropView]) -> dict[int, list[int]]:
+    """Crop width in px -> numbers of the views that have it, in order."""
+    out: dict[int, list[int]] = {}
+    for k, view in enumerate(views):
+        out.setdefault(view.crop.width, []).append(k)
+    return dict(sorted(out.items()))
+
+
+def shared_noise(backbone: Backbone, seed: int, width: int) -> Tensor:
+    """[C, h, w] start of every frame's sampling: one square field for the whole sequence, of which narrower crops get
+    the middle (temporal stability)."""
+    side = backbone.size // backbone.codec.block
+    generator = torch.Generator().manual_seed(seed)
+    field = torch.randn(backbone.codec.channels, side, side, generator=generator)
+    own = width // backbone.codec.block
+    left = (side - own) // 2
+    return field[:, :, left : left + own].to(backbone.device)

@@ -1,0 +1,55 @@
+"""The paper's inpainter: a diffusion model personalised to one person (sec. 3.3)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench.ledger import Ledger
+from ihbench.methods.inpainthuman.inpainting.backbone import Backbone
+from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
+from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
+from ihbench.methods.inpainthuman.inpainting.personalise import Curve, Personaliser
+from ihbench.methods.inpainthuman.inpainting.sampling import inpaint_views
+from ihbench.methods.inpainthuman.inpainting.subject_token import ANYBODY
+from ihbench.progress import Progress
+
+
+def load_backbone(config: InpaintConfig, device: str) -> Backbone:
+    """The backbone that a configuration names. Raises `BadInput` for weights that are missing, wrong or damaged."""
+    if config.backbone == "sd2":
+        from ihbench.methods.inpainthuman.inpainting.sd2_weights import load_sd2
+
+        control = config.control_weights or None
+        return load_sd2(config.weights, control, device=device, memory_lean=config.memory_lean)
+    from ihbench.methods.inpainthuman.inpainting.mini_weights import load_mini
+
+    return load_mini(Path(config.weights) if config.weights else None, device)
+
+
+class DiffusionInpainter:
+    """A backbone, personalised by `learn` from the training views or left generic."""
+
+    name = "diffusion"
+
+    def __init__(self, backbone: Backbone, config: InpaintConfig, seed: int, ledger: Ledger):
+        self.backbone, self.config, self.seed, self.ledger = backbone, config, seed, ledger
+        self.prompt = ANYBODY
+        self.curves: dict[str, Curve] = {}
+
+    def learn(self, views: list[CropView], progress: Progress) -> None:
+        """Personalise, as far as the switches ti, lora and sg ask for it. Changes the backbone."""
+        if self.config.ti or self.config.lora or self.config.sg:
+            person = Personaliser(self.backbone, views, self.config, self.seed, self.ledger)
+            person.run(progress)
+            self.prompt, self.curves = person.prompt, person.curves
+
+    def inpaint(self, views: list[CropView], progress: Progress) -> list[NDArray[np.uint8]]:
+        settled = self.config.settled()
+        return inpaint_views(
+            self.backbone, views, self.prompt, progress,
+            seed=self.seed, steps=settled.sampler_steps, use_parts=self.config.sg, guidance=settled.guidance,
+            noise_scale=settled.noise, batch=self.config.batch,
+        )  # fmt: skip

@@ -1,0 +1,21 @@
+"""The simple fills by name, which the diffusion model is measured against."""
+
+from __future__ import annotations
+
+from ihbench.body import Body
+from ihbench.methods.inpainthuman.inpainting.colour_fills import MeanColour, NavierStokes, PushPull, Telea
+from ihbench.methods.inpainthuman.inpainting.crop_view import Inpainter
+from ihbench.methods.inpainthuman.inpainting.texture_fills import MirroredTexture, TemporalCopy
+
+
+def fillers(body: Body, background: tuple[float, float, float]) -> dict[str, Inpainter]:
+    """Name -> inpainter, in the order of tables. `background` is RGB in [0, 1]."""
+    known: tuple[Inpainter, ...] = (
+        MeanColour(background),
+        Telea(),
+        NavierStokes(),
+        PushPull(background),
+        MirroredTexture(body, background),
+        TemporalCopy(body, background),
+    )
+    return {filler.name: filler for filler in known}

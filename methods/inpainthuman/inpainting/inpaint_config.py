@@ -1,0 +1,153 @@
+"""Every switch of stage 2 (`--method.inpaint.*`). Section numbers are the paper's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from ihbench.errors import BadInput
+
+Filler = Literal["diffusion", "mean", "telea", "navier-stokes", "push-pull", "mirror", "temporal"]
+
+
+@dataclass(frozen=True)
+class Settled:
+    """The fields of `InpaintConfig` that depend on the backbone."""
+
+    vectors: int
+    ti_lr: float
+    tune: Literal["lora", "all"]
+    lora_lr: float
+    control_lr: float
+    sampler_steps: int
+    noise: float
+    guidance: float
+
+
+@dataclass(frozen=True)
+class InpaintConfig:
+    on: bool = True
+    """Stages 2 and 3. Off: stage 1 alone."""
+    filler: Filler = "diffusion"
+    """What paints hidden pixels: the paper's diffusion model, or one of the simple fills beside it in tables."""
+    backbone: Literal["mini", "sd2"] = "mini"
+    """The diffusion model: the small one that comes with the bench, or your own Stable Diffusion 2 inpainting."""
+    weights: str = ""
+    """Folder (diffusers layout, safetensors) or hub id of the weights. sd2 needs it; empty gives the shipped mini."""
+    control_weights: str = ""
+    """sd2: folder of a ControlNet for the part map, or of the 4-channel base UNet to make one from; empty makes one
+    from the inpainting UNet."""
+    ti: bool = True
+    """Textual inversion: learn a word for the person from the best-seen frames (sec. 3.3)."""
+    lora: bool = True
+    """Adapt the UNet to the person by painting visible pixels that were hidden on purpose (sec. 3.3)."""
+    sg: bool = True
+    """Semantic guidance: the ControlNet on the body's part map, adapted together with the UNet (sec. 3.3)."""
+    token: str = "<someone>"
+    """The new word V*."""
+    vectors: int | None = None
+    """Word vectors of V*. None: 4 for mini, which was trained with so many; 1 for sd2, as in the paper."""
+    ti_steps: int = 80
+    """Steps of textual inversion."""
+    ti_lr: float | None = None
+    """AdamW step size of the word vectors. None: 2e-2 for mini; 5e-4 for sd2, as in diffusers' recipe."""
+    ti_frames: float = 0.2
+    """Share of the frames, the best seen, that textual inversion learns from."""
+    text_lora: bool = False
+    """Adapt the text encoder by LoRA during textual inversion, the paper's "jointly fine-tune"."""
+    lora_steps: int = 100
+    """Steps of the adaptation."""
+    tune: Literal["lora", "all"] | None = None
+    """What the adaptation changes in the UNet: LoRA on its attention (the paper), or every weight. None: all for
+    mini, which gains more from it; lora for sd2."""
+    rank: int = 8
+    """Rank of LoRA, and its alpha (sec. 4.2)."""
+    lora_lr: float | None = None
+    """AdamW step size of LoRA, or of every weight. None: 1e-4 for sd2, for mini 3e-4 (1e-3 with LoRA)."""
+    control_lr: float | None = None
+    """AdamW step size of the ControlNet. None: 3e-4 for mini, 1e-5 for sd2."""
+    batch: int = 8
+    """Crops a step, halved when memory runs out."""
+    sampler_steps: int | None = None
+    """DDIM steps. None: 6 for mini, 50 for sd2."""
+    noise: float | None = None
+    """Scale of the noise that sampling starts from. None: 1 for sd2; 0 for mini, whose colours follow strong noise:
+    its mean answer is the better one."""
+    guidance: float | None = None
+    """Classifier-free guidance against the empty prompt; 1 is none. None: 1 for mini, 5 for sd2."""
+    context: Literal["seen", "frame"] = "seen"
+    """What the inpainter is shown besides visible pixels. "seen": hidden pixels whose surface another frame shows are
+    drawn by the stage-1 avatar, and only what no frame shows is painted. "frame": the frame alone, as the paper."""
+    key_views: int = 24
+    """Frames painted at most, chosen to see all of the surface that needs it; 0 for every frame that sees some."""
+    turntable: int = 0
+    """Views of the stage-1 avatar, all around it, inpainted too: the only way to surface that never faced the camera.
+    A departure from the paper; needs context "seen"."""
+    silhouette: Literal["coverage", "grabcut", "sam"] = "coverage"
+    """What finds the complete silhouette in a painted frame: half of the way from the background's colour to the
+    person's, GrabCut, or HQ-SAM (the paper's)."""
+    sam_weights: str = ""
+    """Folder of HQ-SAM weights in transformers' layout, for silhouette "sam"."""
+    memory_lean: bool = False
+    """sd2: checkpointed gradients, the autoencoder in slices and tiles: less memory, more time."""
+
+    def __post_init__(self) -> None:
+        rules = (
+            ("vectors", self.vectors is None or self.vectors >= 1, "1 or more"),
+            ("ti_steps", self.ti_steps >= 1, "1 or more"),
+            ("ti_frames", 0 < self.ti_frames <= 1, "above 0, at most 1"),
+            ("lora_steps", self.lora_steps >= 1, "1 or more"),
+            ("rank", self.rank >= 1, "1 or more"),
+            ("batch", self.batch >= 1, "1 or more"),
+            ("sampler_steps", self.sampler_steps is None or 1 <= self.sampler_steps <= 1000, "1 to 1000"),
+            ("noise", self.noise is None or 0 <= self.noise < float("inf"), "0 or more"),
+            ("guidance", self.guidance is None or self.guidance >= 1, "1 or more"),
+            ("key_views", self.key_views >= 0, "0 or more"),
+            ("turntable", self.turntable >= 0, "0 or more"),
+            (
+                "turntable",
+                not self.turntable or self.context == "seen",
+                '0 unless --method.inpaint.context is "seen"',
+            ),
+            ("token", bool(self.token.strip()) and " " not in self.token, "one word"),
+            ("weights", self.backbone != "sd2" or not self.uses_diffusion or bool(self.weights), SD2_WANTED),
+        )
+        for name, holds, expected in rules:
+            if not holds:
+                raise BadInput(
+                    f"--method.inpaint.{name.replace('_', '-')} {getattr(self, name)!r}: expected {expected}"
+                )
+
+    def settled(self) -> Settled:
+        """The values that are in force, with the backbone's own in the place of None."""
+        own = dict(OWN[self.backbone])
+        if self.backbone == "mini" and self.tune == "lora":
+            own["lora_lr"] = LORA_OF_MINI
+        given = {name: getattr(self, name) for name in own if getattr(self, name) is not None}
+        return Settled(**own | given)
+
+    @property
+    def uses_diffusion(self) -> bool:
+        return self.on and self.filler == "diffusion"
+
+
+SD2_WANTED = (
+    "the folder of Stable Diffusion 2 inpainting (diffusers layout: unet/ vae/ text_encoder/ tokenizer/ scheduler/, "
+    "safetensors), which backbone sd2 needs"
+)
+
+# what a field that is None means
+OWN: dict[str, dict[str, Any]] = {
+    "mini": {
+        "vectors": 4, "ti_lr": 2e-2, "tune": "all", "lora_lr": 3e-4, "control_lr": 3e-4, "sampler_steps": 6,
+        "noise": 0.0, "guidance": 1.0,
+    },
+    "sd2": {
+        "vectors": 1, "ti_lr": 5e-4, "tune": "lora", "lora_lr": 1e-4, "control_lr": 1e-5, "sampler_steps": 50,
+        "noise": 1.0, "guidance": 5.0,
+    },
+}  # fmt: skip
+LORA_OF_MINI = 1e-3  # step size: so few weights need longer steps
+
+QUICK_INPAINT = InpaintConfig()
+PAPER_INPAINT = InpaintConfig(ti_steps=1000, lora_steps=2000, key_views=0)

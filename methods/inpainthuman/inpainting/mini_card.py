@@ -1,0 +1,60 @@
+"""The model card of a trained `mini` backbone."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ihbench import __version__, registry
+from ihbench.atomic import write_json, write_text
+from ihbench.methods.inpainthuman.inpainting.mini_training import MiniTraining
+from ihbench.methods.inpainthuman.inpainting.train_mini import curve_of
+
+CARD = "README.md"
+FIGURES = "training.json"
+
+
+def write_card(folder: Path, config: MiniTraining, seconds: float, validation: dict[str, Any]) -> None:
+    """`README.md` for people and `training.json` for programs, beside the weights."""
+    people = registry.load("people", "procedural")
+    curve = curve_of(folder / "training")
+    write_json(
+        folder / FIGURES,
+        {"config": asdict(config), "seconds": seconds, "validation": validation, "curve": curve},
+    )
+    settings = " ".join(
+        f"--train.{name.replace('_', '-')} {value}" for name, value in asdict(config).items() if name != "save_every"
+    )
+    rows = [f"| {name} | {value:.2f} |" for name, value in validation["hidden_psnr"].items()]
+    thinned = curve[:: max(len(curve) // 20, 1)]
+    points = [f"| {row['step']} | {row['loss']:.4f} | {row['seconds'] / 60:.0f} |" for row in thinned]
+    write_text(folder / CARD, "\n".join([
+        "# mini: a small inpainting diffusion backbone",
+        "",
+        "The classes of Stable Diffusion 2 inpainting (9-channel scheme, text encoder, ControlNet on the SMPL parts)",
+        "at a hundredth of its size, for crops 128 px tall. It knows procedural people and nothing else: it is there",
+        "to run InpaintHuman without any download, on stand-ins; real people want real weights.",
+        "",
+        f"- Data: people 0 to {config.people - 1} of `datasets/standin/passers_by.py` version {people.VERSION}, "
+        f"{config.each} photographs each.",
+        "  Stand-ins of the protocols come from another random stream; none of them is in it.",
+        f"- {config.steps} steps of about eight crops, {seconds / 60:.0f} minutes on two cores, seed {config.seed}.",
+        f"- Made with ihbench {__version__}, torch {torch.__version__}, by",
+        f"  `ihbench train-mini --out DIR {settings}`.",
+        "- Weights are rounded to 16 bit. Licence: that of ihbench.",
+        "",
+        f"PSNR over the hidden pixels of {validation['people']} unseen procedural people behind a central strip over",
+        f"{validation['strip']:.0%} of them, not personalised:",
+        "",
+        "| painter | dB |",
+        "|---|---|",
+        *rows,
+        "",
+        "| step | training loss | minutes |",
+        "|---|---|---|",
+        *points,
+        "",
+    ]))  # fmt: skip

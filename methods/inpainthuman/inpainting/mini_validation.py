@@ -1,0 +1,79 @@
+"""How well a backbone paints procedural people that it was not trained on."""
+
+from __future__ import annotations
+
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ihbench import registry
+from ihbench.methods.inpainthuman.inpainting.backbone import Backbone
+from ihbench.methods.inpainthuman.inpainting.crop_album import PAGE, CropAlbum
+from ihbench.methods.inpainthuman.inpainting.diffusion_batch import DiffusionBatch, shared_noise
+from ihbench.methods.inpainthuman.inpainting.part_map import part_colours
+from ihbench.methods.inpainthuman.inpainting.push_pull import push_pull
+from ihbench.methods.inpainthuman.inpainting.sampling import sample
+from ihbench.methods.inpainthuman.inpainting.subject_token import ANYBODY
+from ihbench.progress import Progress
+
+STEPS = (1, 6, 20)
+NOISES = (0.0, 1.0)
+STRIP = 0.5  # share of the person that the central strip hides
+PEOPLE = 48
+
+
+def validate(backbone: Backbone, album: Path, each: int, progress: Progress) -> dict[str, Any]:
+    """Hidden-body PSNR, pooled, on held-out people with a central strip; nothing is personalised."""
+    people = registry.load("people", "procedural")
+    store = CropAlbum(album, "procedural", each, backbone.size)
+    store.make(people.HELD_OUT, PAGE, progress)
+    page = next(iter(store.pages(people.HELD_OUT, PAGE)))
+    errors: dict[str, list[NDArray[np.float64]]] = {}
+    first = np.array([np.flatnonzero(page.person == k)[0] for k in range(PEOPLE)])
+    with progress.task("validating", PEOPLE) as task:
+        for width in np.unique(page.widths[first]):
+            rows = first[page.widths[first] == width]
+            images, person = page.images[rows, :, :width], page.silhouettes[rows, :, :width]
+            hidden = np.stack([central_strip(mask) for mask in person])
+            batch = DiffusionBatch(
+                pixels=torch.from_numpy(images).movedim(-1, 1).float() / 127.5 - 1,
+                unknown=torch.from_numpy(hidden)[:, None].float(),
+                person=torch.from_numpy(person & ~hidden)[:, None].float(),
+                parts=torch.from_numpy(part_colours(page.parts[rows, :, :width])).movedim(-1, 1).float() / 255,
+            )
+            field = shared_noise(backbone, 0, int(width))
+            made = {
+                "mean visible colour, silhouette given": _mean_colour(batch),
+                "push-pull, silhouette given": push_pull(batch.pixels, batch.person),
+            }
+            for steps, noise, parts in product(STEPS, NOISES, (False, True)):
+                name = f"mini, {steps} steps, noise {noise:g}, {'with' if parts else 'without'} parts"
+                made[name] = sample(backbone, batch, noise * field, ANYBODY, steps=steps, use_parts=parts)
+            where = torch.from_numpy(hidden & person)
+            for name, painted in made.items():
+                error = ((painted - batch.pixels) / 2).square().mean(1)[where]
+                errors.setdefault(name, []).append(error.double().numpy())
+            task.advance(len(rows))
+    psnr = {name: float(-10 * np.log10(np.concatenate(parts).mean())) for name, parts in errors.items()}
+    return {"people": PEOPLE, "strip": STRIP, "hidden_psnr": psnr}
+
+
+def central_strip(person: NDArray[np.bool_], share: float = STRIP) -> NDArray[np.bool_]:
+    """[H, W] the narrowest full-height strip about the person's mean column that hides at least a share of them."""
+    columns = person.sum(0)
+    middle = round(float((columns * np.arange(len(columns))).sum() / max(columns.sum(), 1)))
+    out = np.zeros(person.shape, bool)
+    for half in range(1, len(columns) + 1):
+        out[:, max(middle - half, 0) : middle + half] = True
+        if (person & out).sum() >= share * person.sum():
+            break
+    return out
+
+
+def _mean_colour(batch: DiffusionBatch) -> torch.Tensor:
+    total = (batch.pixels * batch.person).sum((2, 3), keepdim=True)
+    return (total / batch.person.sum((2, 3), keepdim=True).clamp(min=1)).expand_as(batch.pixels)

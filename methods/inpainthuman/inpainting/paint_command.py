@@ -1,0 +1,86 @@
+"""`ihbench paint --protocol P`: how well every painter fills a scene's hidden pixels, against the truth.
+
+For scenes whose truth is known behind the occluder: stand-ins, and captures under a made-up occlusion.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ihbench.commands.scene_choice import ProtocolChanges
+from ihbench.errors import BadInput
+from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
+from ihbench.methods.inpainthuman.inpainting.paint_rows import ROWS
+
+SUMMARY = "how well InpaintHuman's painters fill hidden pixels, against the truth behind the occluder"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaintOptions(ProtocolChanges):
+    protocol: str = "people_snapshot_occ"
+    """A registered protocol (`ihbench list protocols`), or the path of a protocol file of your own (.toml)."""
+    scene: tuple[str, ...] = ()
+    """Scenes; none means all that the protocol names. Stand-ins may be any standin-1, standin-2, …"""
+    rows: tuple[str, ...] = ROWS
+    """Painters to compare."""
+    frames: int = 20
+    """Training frames painted, evenly spread; personalisation sees all."""
+    seed: tuple[int, ...] = (0,)
+    """Seeds; their scores are averaged per scene before anything else."""
+    profile: str = "quick"
+    """quick or paper: the size of the images."""
+    data: Path | None = None
+    """Your copy of the data set; without it (and without IHBENCH_DATA) a stand-in."""
+    body: Path | None = None
+    """SMPL model file for real data (or IHBENCH_BODY)."""
+    out: Path | None = None
+    """Folder for `paint.json`, the table and a picture per scene."""
+    inpaint: InpaintConfig = field(default_factory=InpaintConfig)
+    """How diffusion is personalised and sampled."""
+    json: bool = False
+    """Print one JSON object on stdout and nothing else there."""
+
+
+def main(argv: list[str]) -> int:
+    from ihbench.commands.parse import options
+
+    chosen = options(PaintOptions, argv, "paint", "Compare painters on hidden pixels whose truth is known.")
+    return _paint(chosen)
+
+
+def _paint(chosen: Any) -> int:
+    from ihbench import registry
+    from ihbench.atomic import write_bytes, write_json, write_text
+    from ihbench.data_source import locate
+    from ihbench.methods.inpainthuman.inpainting.grid import png
+    from ihbench.methods.inpainthuman.inpainting.paint_table import paint_scene, summary, table
+    from ihbench.progress import Progress
+    from ihbench.protocol import load_protocol
+
+    for row in chosen.rows:
+        if row not in ROWS:
+            raise BadInput(f"--rows {row}: {registry.nearest(row, list(ROWS))}")
+    if chosen.frames < 1 or not chosen.seed:
+        raise BadInput(f"--frames {chosen.frames}, {len(chosen.seed)} seeds: expected 1 or more of both")
+    protocols = chosen.apply(load_protocol(chosen.protocol, chosen.profile))
+    if len(protocols) > 1:
+        raise BadInput("--occlusion.fraction: one severity at a time")
+    progress, scenes = Progress(), {}
+    source = locate(protocols[0], chosen.data, chosen.scene)
+    for scene in source.scenes:
+        capture, body = source.open(scene, chosen.body, progress)
+        scenes[scene], picture = paint_scene(
+            capture, body, protocols[0], chosen.rows, chosen.frames, chosen.seed, chosen.inpaint, progress
+        )
+        if chosen.out is not None:
+            write_bytes(chosen.out / f"{scene}.png", png(picture))
+            write_json(chosen.out / "paint.json", {"scenes": scenes, "summary": summary(scenes)})
+    result = summary(scenes)
+    text = table(result, f"{protocols[0].name}, {len(scenes)} scenes, {capture.standin or capture.variant}")
+    if chosen.out is not None:
+        write_text(chosen.out / "paint.md", text + "\n")
+    print(json.dumps({"scenes": scenes, "summary": result}) if chosen.json else text)
+    return 0

@@ -1,0 +1,164 @@
+"""Painters side by side on one task: fill the hidden pixels of single frames, truth known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench.body import Body
+from ihbench.errors import BadInput
+from ihbench.ledger import Ledger
+from ihbench.methods.inpainthuman.inpainting.crop_view import CropView, cut_view
+from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
+from ihbench.methods.inpainthuman.inpainting.paint_rows import DIFFUSION, FILLS, FULL
+from ihbench.metrics.statistics import mean_interval, paired_test
+from ihbench.progress import Progress
+from ihbench.protocol import Protocol
+from ihbench.scene import Capture
+from ihbench.views import open_scene
+
+SIZE = 128  # px, height of the crops of every painter, so that they paint the same pixels
+SCORES = ("psnr", "ssim", "flip")
+
+
+def paint_scene(
+    capture: Capture,
+    body: Body,
+    protocol: Protocol,
+    rows: Sequence[str],
+    frames: int,
+    seeds: Sequence[int],
+    config: InpaintConfig,
+    progress: Progress,
+) -> tuple[dict[str, Any], NDArray[np.uint8]]:
+    """Row -> scores over the scene's hidden pixels, and a picture. Raises `BadInput` when nothing is hidden."""
+    from ihbench.methods.inpainthuman.inpainting.drift import flicker, hidden_scores, identity_drift
+
+    occluded = open_scene(capture, protocol).train
+    whole = open_scene(capture, protocol.with_occlusion("none")).train
+    with progress.task(f"cutting {capture.name}", 2 * len(occluded)) as task:
+        views, truths = [], []
+        for k in range(len(occluded)):
+            views.append(cut_view(occluded[k], k, body, SIZE))
+            truths.append(cut_view(whole[k], k, body, SIZE))
+            task.advance(2)
+    hiding = [k for k, view in enumerate(views) if view.unknown.any()]
+    if not hiding:
+        raise BadInput(f"scene {capture.name}: no training frame hides anything under {protocol.name}")
+    chosen = [hiding[k] for k in np.unique(np.linspace(0, len(hiding) - 1, min(frames, len(hiding))).astype(int))]
+    asked = [views[k] for k in chosen]
+    truth_images = [truths[k].image for k in chosen]
+    silhouettes = [truths[k].person for k in chosen]
+    found: dict[str, Any] = {}
+    pictures: dict[str, NDArray[np.uint8]] = {}
+    for row in rows:
+        scored = []
+        for seed in seeds if row in DIFFUSION else seeds[:1]:
+            ledger = Ledger()
+            with ledger.stage("paint"):
+                painted = _paint(row, views, chosen, body, protocol.image.background, config, seed, ledger, progress)
+            scores = hidden_scores(painted, truth_images, asked, silhouettes, protocol.image.background)
+            drift, flick = identity_drift(asked, painted, body), flicker(asked, painted, body)
+            scored.append(
+                {name: scores["hidden"]["pooled"][name] for name in SCORES}
+                | {f"{name}_on_body": scores["on_body"]["pooled"][name] for name in SCORES}
+                | {"delta_e": drift.delta_e, "flicker": flick.deviation, "seconds": ledger.seconds}
+            )
+            pictures.setdefault(row, _row(painted))
+        found[row] = {name: float(np.mean([s[name] for s in scored])) for name in scored[0]}
+        progress.say(f"{capture.name} {row}: {found[row]['psnr']:.2f} dB, {found[row]['seconds']:.0f} s")
+    masked = [np.where(view.unknown[..., None], np.uint8(128), view.image) for view in asked]
+    picture = np.concatenate([_row(truth_images), _row(masked), *pictures.values()], 0)
+    return found, picture
+
+
+def _paint(
+    row: str,
+    views: list[CropView],
+    chosen: list[int],
+    body: Body,
+    background: tuple[float, float, float],
+    config: InpaintConfig,
+    seed: int,
+    ledger: Ledger,
+    progress: Progress,
+) -> list[NDArray[np.uint8]]:
+    if row in FILLS:
+        from ihbench.methods.inpainthuman.inpainting.fillers import fillers
+
+        painted = fillers(body, background)[row].inpaint(views, progress)
+        return [painted[k] for k in chosen]
+    from ihbench.methods.inpainthuman.inpainting.diffusion_inpainter import DiffusionInpainter, load_backbone
+
+    ti, lora, sg = DIFFUSION[row]
+    switched = replace(config, ti=ti, lora=lora, sg=sg)
+    painter = DiffusionInpainter(load_backbone(switched, "cpu"), switched, seed, ledger)
+    if ti or lora:  # a generic model learns nothing of the person, its ControlNet neither
+        painter.learn(views, progress)
+    return painter.inpaint([views[k] for k in chosen], progress)
+
+
+def _row(images: Sequence[NDArray[np.uint8]], most: int = 10) -> NDArray[np.uint8]:
+    shown = [images[k] for k in np.unique(np.linspace(0, len(images) - 1, min(most, len(images))).astype(int))]
+    cells = [np.pad(image, ((2, 2), (0, SIZE - image.shape[1]), (0, 0)), constant_values=200) for image in shown]
+    return np.concatenate(cells, 1)
+
+
+def summary(scenes: Mapping[str, Mapping[str, Mapping[str, float]]]) -> dict[str, Any]:
+    """Row -> score -> mean over scenes with its interval, and the full method's paired lead in PSNR."""
+    out: dict[str, Any] = {}
+    rows = list(next(iter(scenes.values())))
+    for row in rows:
+        out[row] = {}
+        for score in scenes[next(iter(scenes))][row]:
+            values = {scene: scores[row][score] for scene, scores in scenes.items()}
+            finite = {scene: value for scene, value in values.items() if math.isfinite(value)}
+            if finite:
+                interval = mean_interval(finite)
+                out[row][score] = {
+                    "mean": interval.value,
+                    "low": interval.low,
+                    "high": interval.high,
+                    "n": interval.n,
+                }
+        if FULL in rows and row != FULL and len(scenes) > 1:
+            full = {scene: scores[FULL]["psnr"] for scene, scores in scenes.items()}
+            own = {scene: scores[row]["psnr"] for scene, scores in scenes.items()}
+            lead = paired_test(full, own)
+            out[row]["lead"] = {
+                "mean": lead.interval.value, "low": lead.interval.low, "high": lead.interval.high, "p": lead.p,
+            }  # fmt: skip
+    return out
+
+
+def table(result: Mapping[str, Any], title: str) -> str:
+    """Markdown."""
+    lines = [
+        f"### Hidden person pixels: {title}",
+        "",
+        "| painter | PSNR ↑ (95 %) | on the body model ↑ | SSIM ↑ | FLIP ↓ | drift ΔE ↓ | flicker ↓ | s "
+        f"| {FULL} leads by |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for row, scores in result.items():
+        cells = [
+            _told(scores.get("psnr"), 2, True), _told(scores.get("psnr_on_body"), 2), _told(scores.get("ssim"), 3),
+            _told(scores.get("flip"), 3), _told(scores.get("delta_e"), 1), _told(scores.get("flicker"), 3),
+            _told(scores.get("seconds"), 0), _told(scores.get("lead"), 2, True),
+        ]  # fmt: skip
+        lines.append(f"| {row} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _told(score: Mapping[str, float] | None, digits: int, interval: bool = False) -> str:
+    if score is None:
+        return "-"
+    text = f"{score['mean']:.{digits}f}"
+    if interval and math.isfinite(score["low"]):
+        text += f" ({score['low']:.{digits}f} to {score['high']:.{digits}f})"
+    return text

@@ -1,0 +1,117 @@
+"""Inpainting with a backbone: DDIM from shared noise, the original kept wherever it is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ihbench.errors import BadInput, Diverged
+from ihbench.methods.inpainthuman.inpainting.backbone import Backbone
+from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
+from ihbench.methods.inpainthuman.inpainting.diffusion_batch import DiffusionBatch, batch_of, by_width, shared_noise
+from ihbench.progress import Progress
+
+
+@torch.no_grad()
+def sample(
+    backbone: Backbone,
+    batch: DiffusionBatch,
+    noise: Tensor,  # [C, h, w] or [B, C, h, w]
+    prompt: str,
+    *,
+    steps: int,
+    use_parts: bool,
+    guidance: float = 1.0,
+    negative: str = "",
+) -> Tensor:
+    """[B, 3, H, W] in [-1, 1]: what the model paints, known pixels not yet put back.
+
+    `guidance` above 1 is classifier-free guidance against the prompt `negative`.
+    """
+    scheduler = backbone.scheduler
+    scheduler.set_timesteps(steps, device=backbone.device)
+    condition = backbone.condition(batch.pixels.to(backbone.dtype), batch.unknown, batch.person)
+    prompts = [prompt] if guidance <= 1 else [prompt, negative]
+    text = backbone.text(prompts)
+    parts = batch.parts if use_parts else None
+    latents = noise.expand(len(batch), *noise.shape[-3:]).to(backbone.dtype) * scheduler.init_noise_sigma
+    for t in scheduler.timesteps:
+        given = scheduler.scale_model_input(latents, t)
+        predicted = _predict(backbone, given, t, condition, text, parts, guidance)
+        latents = scheduler.step(predicted, t, latents, return_dict=False)[0]
+    return backbone.codec.decode(latents).float().clamp(-1, 1)
+
+
+def _predict(
+    backbone: Backbone,
+    noisy: Tensor,
+    t: Tensor,
+    condition: Tensor,
+    text: Tensor,
+    parts: Tensor | None,
+    guidance: float,
+) -> Tensor:
+    n = len(noisy)
+    times = t.expand(n)
+    said = backbone.predict(noisy, times, condition, text[:1].expand(n, -1, -1), parts)
+    if len(text) == 1:
+        return said
+    unsaid = backbone.predict(noisy, times, condition, text[1:].expand(n, -1, -1), parts)
+    return unsaid + guidance * (said - unsaid)
+
+
+def inpaint_views(
+    backbone: Backbone,
+    views: list[CropView],
+    prompt: str,
+    progress: Progress,
+    *,
+    seed: int,
+    steps: int,
+    use_parts: bool,
+    guidance: float = 1.0,
+    noise_scale: float = 1.0,
+    batch: int = 8,
+) -> list[NDArray[np.uint8]]:
+    """One completed crop per view. A batch that does not fit into memory is halved; when a single crop does not fit,
+    `BadInput` says so. `Diverged` for a result that is not finite."""
+    out: list[NDArray[np.uint8]] = [view.image for view in views]
+    todo = [view if view.unknown.any() else None for view in views]
+    with progress.task("inpainting", sum(view is not None for view in todo)) as task:
+        for width, numbers in by_width(views).items():
+            noise = noise_scale * shared_noise(backbone, seed, width)
+            rest = [k for k in numbers if todo[k] is not None]
+            while rest:
+                now, rest = rest[:batch], rest[batch:]
+                try:
+                    painted = sample(
+                        backbone, batch_of([views[k] for k in now], backbone.device), noise, prompt,
+                        steps=steps, use_parts=use_parts, guidance=guidance,
+                    )  # fmt: skip
+                except (torch.OutOfMemoryError, MemoryError, RuntimeError) as error:
+                    if not out_of_memory(error):
+                        raise
+                    if batch == 1:
+                        raise BadInput(
+                            f"inpainting: one crop of {width}×{backbone.size} px does not fit into memory; use "
+                            f"--method.inpaint.memory-lean or a smaller backbone"
+                        ) from error
+                    batch, rest = max(batch // 2, 1), now + rest
+                    continue
+                if not torch.isfinite(painted).all():
+                    raise Diverged(0, "the inpainted image is not finite")
+                pixels = ((painted + 1) * 127.5).round().to(torch.uint8).movedim(1, -1).cpu().numpy()
+                for k, image in zip(now, pixels, strict=True):
+                    out[k] = views[k].completed(image)
+                task.advance(len(now))
+    return out
+
+
+def out_of_memory(error: BaseException) -> bool:
+    """Whether an error says that memory ran out, on whatever device."""
+    words = str(error).lower()
+    return isinstance(error, torch.OutOfMemoryError | MemoryError) or (
+        "out of memory" in words or "can't allocate memory" in words
+    )

@@ -1,0 +1,373 @@
+"""The `sd2` backbone: the user's own Stable Diffusion 2 inpainting weights.
+
+The folder is in diffusers layout, safetensors only:
+
+    model_index.json                                  (not needed)
+    unet/          config.json  diffusion_pytorch_model.safetensors   9 input channels
+    vae/           config.json  diffusion_pytorch_model.safetensors
+    text_encoder/  config.json  model.safetensors
+    tokenizer/     tokenizer_config.json, and vocab.json with merges.txt, or tokenizer.json
+    scheduler/     scheduler_config.json
+
+File names with a variant (`…model.fp16.safetensors`) and shards are found too. Every `config.json`, and the header
+of every weights file, is checked before a weight is read; the layers are those of Stable Diffusion 2, the widths are
+free, so that a miniature goes through the same door. The modules are built here from the checked configurations, not
+by `from_pretrained`, which makes up what a file lacks and may ask the hub.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ihbench.errors import BadInput
+from ihbench.methods.inpainthuman.inpainting.backbone import Backbone, LatentAutoencoder
+from ihbench.methods.inpainthuman.inpainting.checkpoint import (
+    CONVERT,
+    UnreadModule,
+    find_folder,
+    has_pickles,
+    read_json,
+    weight_files,
+)
+from ihbench.methods.inpainthuman.inpainting.part_controlnet import new_controlnet
+from ihbench.methods.inpainthuman.inpainting.sampling import out_of_memory
+
+STEMS = {"unet": "diffusion_pytorch_model", "vae": "diffusion_pytorch_model", "text_encoder": "model"}
+OPTION, CONTROL_OPTION = "--method.inpaint.weights", "--method.inpaint.control-weights"
+LAYOUT = (
+    "expected Stable Diffusion 2 inpainting in diffusers layout: unet/, vae/, text_encoder/ (config.json and "
+    "safetensors in each), tokenizer/, scheduler/scheduler_config.json"
+)
+WRONG_MODEL = "expected Stable Diffusion 2 inpainting"
+CONTROL_WANTED = (
+    "expected a ControlNet for Stable Diffusion 2 or its 4-channel base UNet; without one a ControlNet is made from "
+    "the inpainting UNet"
+)
+DTYPES = {"fp32": torch.float32, "fp16": torch.float16, "bf16": torch.bfloat16}
+ENCODER_SHAPE = (
+    "block_out_channels", "down_block_types", "layers_per_block", "cross_attention_dim", "attention_head_dim",
+    "use_linear_projection",
+)  # fmt: skip
+TEXT_FIELDS = (
+    "vocab_size", "hidden_size", "intermediate_size", "projection_dim", "num_hidden_layers", "num_attention_heads",
+    "max_position_embeddings", "hidden_act", "layer_norm_eps", "attention_dropout", "pad_token_id", "bos_token_id",
+    "eos_token_id",
+)  # fmt: skip
+TEXT_EXTRAS = ("vision_model.", "visual_projection.", "text_projection.", "logit_scale")  # of a whole CLIP
+OLD_ATTENTION = {
+    "query": "to_q",
+    "key": "to_k",
+    "value": "to_v",
+    "proj_attn": "to_out.0",
+}  # VAE before diffusers 0.14
+
+
+def load_sd2(
+    weights: str,
+    control: str | None = None,
+    base: str | None = None,
+    *,
+    device: torch.device | str,
+    dtype: str = "auto",
+    memory_lean: bool = False,
+) -> Backbone:
+    """The backbone of the folder or cached hub id `weights`, frozen, on `device`.
+
+    The ControlNet is `control` (its folder), or made from the four-channel Stable Diffusion 2 UNet of `base`, or else
+    from the inpainting UNet. A `control` that holds such a UNet is taken for `base`. `dtype` is fp32, fp16, bf16, or
+    auto: on CUDA bf16, where it lacks that fp16, elsewhere fp32. A VAE with `force_upcast` (its default) stays in
+    fp32.
+    `memory_lean` checkpoints gradients, and has the VAE take one image at a time, large ones in tiles: slower, same
+    results within rounding.
+
+    Raises `BadInput` for a folder that is incomplete, another model, pickled, cut short, inconsistent or not finite,
+    and when the device has too little memory.
+    """
+    device = torch.device(device)
+    number = _number_type(dtype, device)
+    folder = find_folder(weights, OPTION)
+    _check_layout(folder)
+    configs = {part: read_json(folder / part / "config.json") for part in STEMS}
+    _check_model(folder, configs)
+    scheduler, tokenizer = _scheduler(folder), _tokenizer(folder, configs["text_encoder"])
+    unet, vae, text_encoder = _unread(folder, configs)
+    controlnet, base_unet = _unread_control(control, base, unet.module.config, vae.module.config)
+    vae_number = torch.float32 if vae.module.config["force_upcast"] else number
+    try:  # part by part, so that no more than one is in memory twice
+        text_encoder = text_encoder.read(device, number)
+        vae = vae.read(device, vae_number)
+        if base_unet is not None:
+            controlnet = new_controlnet(base_unet.read(torch.device("cpu"), number), 4, device, number)
+            base_unet = None
+        unet = unet.read(device, number)
+        if controlnet is None:
+            controlnet = new_controlnet(unet, 4, device, number)
+        elif isinstance(controlnet, UnreadModule):
+            controlnet = controlnet.read(device, number)
+    except (MemoryError, RuntimeError) as error:
+        if not out_of_memory(error):
+            raise
+        raise BadInput(
+            f"{OPTION} {folder}: {device} has too little free memory for these weights; free some, or use another GPU"
+        ) from error
+    if memory_lean:
+        _save_memory(unet, controlnet, vae)
+    if device.type == "cuda":
+        for module in (unet, controlnet, vae):
+            module.to(memory_format=torch.channels_last)
+    codec = LatentAutoencoder(vae)
+    size = int(unet.config["sample_size"] or 64) * codec.block
+    return Backbone("sd2", unet, text_encoder, tokenizer, controlnet, codec, scheduler, size, square=True)
+
+
+def _number_type(dtype: str, device: torch.device) -> torch.dtype:
+    if dtype != "auto":
+        if dtype not in DTYPES:
+            raise BadInput(f"dtype {dtype!r}: expected auto, {', '.join(DTYPES)}")
+        return DTYPES[dtype]
+    if device.type != "cuda":
+        return torch.float32
+    native = torch.cuda.get_device_capability(device)[0] >= 8  # is_bf16_supported counts emulation too
+    return torch.bfloat16 if native else torch.float16
+
+
+# --- before a weight is read ---
+
+
+def _check_layout(folder: Path) -> None:
+    """Everything that is missing, in one line."""
+    if (folder / "text_encoder_2").is_dir():
+        raise BadInput(f"{folder}: this is SDXL (it has text_encoder_2/); {WRONG_MODEL}")
+    if (folder / "transformer").is_dir():
+        raise BadInput(f"{folder}: this is a model with a transformer/ for a UNet; {WRONG_MODEL}")
+    if (folder / "config.json").is_file() and not (folder / "unet").is_dir():
+        raise BadInput(f"{folder}: this is one part of a model; give the folder above it; {LAYOUT}")
+    lacking, pickled = [], []
+    for part, stem in STEMS.items():
+        if not (folder / part).is_dir():
+            lacking.append(f"{part}/")
+            continue
+        if not (folder / part / "config.json").is_file():
+            lacking.append(f"{part}/config.json")
+        if not weight_files(folder / part, stem):
+            (pickled if has_pickles(folder / part) else lacking).append(f"{part}/{stem}.safetensors")
+    tokenizer = folder / "tokenizer"
+    if not tokenizer.is_dir():
+        lacking.append("tokenizer/")
+    elif not (tokenizer / "tokenizer.json").is_file():
+        lacking += [f"tokenizer/{n}" for n in ("vocab.json", "merges.txt") if not (tokenizer / n).is_file()]
+    if not (folder / "scheduler" / "scheduler_config.json").is_file():
+        lacking.append("scheduler/scheduler_config.json")
+    if lacking:
+        raise BadInput(f"{folder}: lacks {', '.join(lacking)}; {LAYOUT}")
+    if pickled:
+        raise BadInput(
+            f"{folder}: has pickles (.bin, .ckpt, .pt) for {', '.join(pickled)}; they are refused; {CONVERT}"
+        )
+
+
+def _check_model(folder: Path, configs: dict[str, dict[str, Any]]) -> None:
+    """Stable Diffusion 2 inpainting by its layers; widths are only compared with each other."""
+    unet, vae, text = configs["unet"], configs["vae"], configs["text_encoder"]
+    where = folder / "unet" / "config.json"
+    _check_sd2_unet(where, unet)
+    channels = unet.get("in_channels")
+    if channels == 4:
+        raise BadInput(
+            f"{where}: in_channels is 4: this is the base model, not the inpainting one (9); {WRONG_MODEL}. The base "
+            f"model may be given as {CONTROL_OPTION}"
+        )
+    if channels != 9:
+        raise BadInput(
+            f"{where}: in_channels is {channels}, expected 9 (latents, mask, masked latents); {WRONG_MODEL}"
+        )
+    if vae.get("_class_name") != "AutoencoderKL" or vae.get("latent_channels") != 4:
+        raise BadInput(
+            f"{folder / 'vae' / 'config.json'}: {vae.get('_class_name')} with {vae.get('latent_channels')} latent "
+            f"channels, expected AutoencoderKL with 4; {WRONG_MODEL}"
+        )
+    where, width = folder / "text_encoder" / "config.json", unet["cross_attention_dim"]
+    if text.get("model_type", "clip_text_model") != "clip_text_model":
+        raise BadInput(f"{where}: model_type is {text['model_type']}, expected clip_text_model; {WRONG_MODEL}")
+    if text.get("hidden_size") != width:
+        raise BadInput(
+            f"{where}: hidden_size is {text.get('hidden_size')}, but the UNet reads text of width {width} "
+            f"(cross_attention_dim); take both from one source"
+        )
+
+
+def _check_sd2_unet(where: Path, unet: dict[str, Any]) -> None:
+    """What sets the UNet of Stable Diffusion 2 apart, whatever its width and its input channels."""
+    if unet.get("_class_name") != "UNet2DConditionModel":
+        raise BadInput(f"{where}: {unet.get('_class_name')}, expected UNet2DConditionModel; {WRONG_MODEL}")
+    if unet.get("addition_embed_type") == "text_time" or unet.get("cross_attention_dim") == 2048:
+        raise BadInput(f"{where}: this is SDXL; {WRONG_MODEL}")
+    heads = unet.get("attention_head_dim")
+    if not unet.get("use_linear_projection") or not isinstance(heads, list) or unet.get("cross_attention_dim") == 768:
+        raise BadInput(
+            f"{where}: this is Stable Diffusion 1.5 or a model like it (attention_head_dim {heads}, "
+            f"cross_attention_dim {unet.get('cross_attention_dim')}); {WRONG_MODEL}"
+        )
+    if not isinstance(unet.get("cross_attention_dim"), int) or unet.get("out_channels") != 4:
+        raise BadInput(
+            f"{where}: out_channels {unet.get('out_channels')}, cross_attention_dim "
+            f"{unet.get('cross_attention_dim')}; expected 4 and one number; {WRONG_MODEL}"
+        )
+
+
+def _unread(folder: Path, configs: dict[str, dict[str, Any]]) -> tuple[Any, Any, Any]:
+    from diffusers import AutoencoderKL, UNet2DConditionModel
+    from transformers import CLIPTextConfig, CLIPTextModel
+
+    # only known fields: a configuration may also name code or files elsewhere
+    fields = {name: value for name, value in configs["text_encoder"].items() if name in TEXT_FIELDS}
+    unet = _empty(folder / "unet", lambda: UNet2DConditionModel.from_config(configs["unet"]))
+    vae = _empty(folder / "vae", lambda: AutoencoderKL.from_config(configs["vae"]))
+    text = _empty(folder / "text_encoder", lambda: CLIPTextModel(CLIPTextConfig(**fields)))
+    prefix = "text_model." if any(name.startswith("text_model.") for name in text.state_dict()) else ""
+
+    def text_name(stored: str) -> str | None:
+        if stored.startswith(TEXT_EXTRAS) or stored.endswith("position_ids"):
+            return None
+        return prefix + stored.removeprefix("text_model.")  # transformers 5 has dropped the prefix
+
+    return (
+        UnreadModule(unet, folder / "unet", STEMS["unet"]),
+        UnreadModule(vae, folder / "vae", STEMS["vae"], _vae_name),
+        UnreadModule(text, folder / "text_encoder", STEMS["text_encoder"], text_name),
+    )
+
+
+def _vae_name(stored: str) -> str:
+    head, _, last = stored.rpartition(".")
+    owner, _, layer = head.rpartition(".")
+    return f"{owner}.{OLD_ATTENTION[layer]}.{last}" if layer in OLD_ATTENTION else stored
+
+
+def _empty(folder: Path, build: Callable[[], Any]) -> Any:
+    """A module with parameters on the meta device. Raises `BadInput` when the library rejects its configuration."""
+    from accelerate import init_empty_weights
+
+    try:
+        with init_empty_weights(include_buffers=False):
+            return build()
+    except Exception as error:  # the libraries raise all sorts for a bad value
+        first = str(error).strip().splitlines() or [type(error).__name__]
+        raise BadInput(
+            f"{folder / 'config.json'}: not a usable configuration ({first[0]}); fetch it again"
+        ) from error
+
+
+def _unread_control(
+    control: str | None, base: str | None, unet: dict[str, Any], vae: dict[str, Any]
+) -> tuple[Any, UnreadModule | None]:
+    """The ControlNet of `control`, or the UNet to make one from; neither when neither is given. `unet` and `vae` are
+    the configurations that it has to go with."""
+    from diffusers import ControlNetModel, UNet2DConditionModel
+
+    if control and base:
+        raise BadInput(f"{CONTROL_OPTION}: give a ControlNet ({control}) or the base UNet ({base}), not both")
+    if not control and not base:
+        return None, None
+    folder = find_folder(str(control or base), CONTROL_OPTION)
+    for part in ("unet", "controlnet"):
+        if not (folder / "config.json").is_file() and (folder / part / "config.json").is_file():
+            folder = folder / part
+    where = folder / "config.json"
+    if not where.is_file():
+        raise BadInput(f"{CONTROL_OPTION} {folder}: lacks config.json; {CONTROL_WANTED}")
+    config = read_json(where)
+    kind = config.get("_class_name")
+    if kind == "UNet2DConditionModel":
+        _check_sd2_unet(where, config)
+        module = _empty(folder, lambda: UNet2DConditionModel.from_config(config))
+    elif kind == "ControlNetModel" and not base:
+        module = _empty(folder, lambda: ControlNetModel.from_config(config))
+        colours, per_latent = (
+            module.config["conditioning_channels"],
+            _halvings("conditioning_embedding", module.config),
+        )
+        if (colours, per_latent) != (3, _halvings("block", vae)):
+            raise BadInput(
+                f"{where}: takes {colours} channels at {per_latent} px a latent pixel, expected 3 (the part map is "
+                f"RGB) at {_halvings('block', vae)}; {CONTROL_WANTED}"
+            )
+    else:
+        raise BadInput(f"{where}: {kind}; {CONTROL_WANTED}")
+    if module.config["in_channels"] != 4:
+        raise BadInput(
+            f"{where}: in_channels is {module.config['in_channels']}, expected 4 (the noisy latents); "
+            f"{CONTROL_WANTED}"
+        )
+    for name in ENCODER_SHAPE:
+        theirs, ours = module.config[name], unet[name]
+        if _listed(theirs) != _listed(ours):
+            raise BadInput(f"{where}: {name} is {theirs}, but the inpainting UNet has {ours}; {CONTROL_WANTED}")
+    unread = UnreadModule(module, folder, STEMS["unet"])
+    return (None, unread) if kind == "UNet2DConditionModel" else (unread, None)
+
+
+def _halvings(what: str, config: dict[str, Any]) -> int:
+    """Pixels along a latent pixel."""
+    return 2 ** (len(config[f"{what}_out_channels"]) - 1)
+
+
+def _listed(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _scheduler(folder: Path) -> Any:
+    """DDIM with the noise schedule and the prediction type that the weights were trained with."""
+    import inspect
+
+    from diffusers import DDIMScheduler
+
+    where = folder / "scheduler" / "scheduler_config.json"
+    config = read_json(where)
+    if "beta_schedule" not in config:
+        raise BadInput(f"{where}: {config.get('_class_name')} without beta_schedule; {WRONG_MODEL}")
+    if config.get("prediction_type", "epsilon") not in ("epsilon", "v_prediction"):
+        raise BadInput(
+            f"{where}: prediction_type is {config['prediction_type']}, expected epsilon or v_prediction; "
+            f"{WRONG_MODEL}"
+        )
+    known = inspect.signature(DDIMScheduler.__init__).parameters
+    fields = {name: value for name, value in config.items() if name in known}
+    # other schedulers do not name it, and DDIM's own default clips, which is wrong for latents
+    fields.setdefault("clip_sample", False)
+    try:
+        return DDIMScheduler(**fields)
+    except (TypeError, ValueError, NotImplementedError, RuntimeError) as error:
+        raise BadInput(f"{where}: not a usable configuration ({error}); fetch it again") from error
+
+
+def _tokenizer(folder: Path, text: dict[str, Any]) -> Any:
+    """CLIP's tokenizer. `CLIPTokenizerFast` reads both layouts in transformers 4, and is `CLIPTokenizer` in 5."""
+    from transformers import CLIPTokenizerFast  # type: ignore[attr-defined]  # made on the fly in 5
+
+    where = folder / "tokenizer"
+    try:
+        tokenizer: Any = CLIPTokenizerFast.from_pretrained(str(where), local_files_only=True)
+    except Exception as error:  # the libraries raise all sorts for a bad file
+        first = str(error).strip().splitlines() or [type(error).__name__]
+        raise BadInput(f"{where}: not a readable CLIP tokenizer ({first[0]}); fetch this folder again") from error
+    size = text.get("vocab_size")
+    if not isinstance(size, int) or len(tokenizer) > size:
+        raise BadInput(
+            f"{where}: {len(tokenizer)} tokens, but the text encoder has {size} (vocab_size); take both from one "
+            f"source"
+        )
+    return tokenizer
+
+
+def _save_memory(unet: Any, controlnet: Any, vae: Any) -> None:
+    """Attention is not sliced: torch's fused attention takes less memory whole (64² tokens, 5 heads, with gradients:
+    110 MB, sliced 930 MB, and half the time)."""
+    unet.enable_gradient_checkpointing()
+    controlnet.enable_gradient_checkpointing()
+    vae.enable_slicing()
+    vae.enable_tiling()

@@ -1,0 +1,59 @@
+"""`ihbench train-mini --out DIR`: train the small backbone on procedural people. Resumable."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ihbench.errors import BadInput
+from ihbench.methods.inpainthuman.inpainting.mini_training import MiniTraining
+
+SUMMARY = "train the small diffusion backbone on procedural people; goes on where it stopped"
+TRAINING = "training"  # folder in the output: state and loss curve
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainMiniOptions:
+    out: Path
+    """Folder of the backbone; its folder `training` holds the state, so that the same command goes on."""
+    album: Path | None = None
+    """Folder of the photographs; by default in the cache."""
+    train: MiniTraining = field(default_factory=MiniTraining)
+    """How it is trained."""
+    json: bool = False
+    """Print one JSON object on stdout and nothing else there."""
+
+
+def main(argv: list[str]) -> int:
+    from ihbench.commands.parse import options
+
+    chosen = options(TrainMiniOptions, argv, "train-mini", "Train the small diffusion backbone.")
+    result = _train(chosen)
+    print(json.dumps(result) if chosen.json else _told(result, chosen.out))
+    return 0
+
+
+def _train(chosen: Any) -> dict[str, Any]:
+    from ihbench.data_source import cache_folder
+    from ihbench.methods.inpainthuman.inpainting.mini_card import write_card
+    from ihbench.methods.inpainthuman.inpainting.mini_validation import validate
+    from ihbench.methods.inpainthuman.inpainting.mini_weights import SHIPPED, save_mini
+    from ihbench.methods.inpainthuman.inpainting.train_mini import MiniTrainer
+    from ihbench.progress import Progress
+
+    if chosen.out.resolve() == SHIPPED.resolve():
+        raise BadInput(f"--out {chosen.out}: holds the shipped backbone; train in a folder of your own")
+    album = chosen.album or cache_folder() / "album"
+    trainer = MiniTrainer(chosen.train, chosen.out / TRAINING, album, Progress())
+    backbone = trainer.run()
+    save_mini(backbone, chosen.out)
+    result = validate(backbone, album, chosen.train.each, Progress())
+    write_card(chosen.out, chosen.train, trainer.seconds, result)
+    return result
+
+
+def _told(result: dict[str, Any], out: Path) -> str:
+    lines = [f"{name:<40}{value:6.2f} dB" for name, value in result["hidden_psnr"].items()]
+    return "\n".join([f"hidden pixels of {result['people']} unseen people:", *lines, f"backbone: {out}"])

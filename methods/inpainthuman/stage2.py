@@ -1,0 +1,165 @@
+"""Stage 2, inpainting (sec. 3.3): personalise a painter, paint what no view shows, find whole silhouettes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench.ledger import Ledger
+from ihbench.methods.inpainthuman.avatar import GaussianAvatar
+from ihbench.methods.inpainthuman.inpainting.crop_view import CropView, Inpainter, cut_view
+from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
+from ihbench.methods.inpainthuman.inpainting.painted_view import PaintedView, paste_back
+from ihbench.methods.inpainthuman.inpainting.shown_view import turntable_view, with_known_surface
+from ihbench.methods.inpainthuman.inpainting.surface_need import SeenSurface, key_views, seen_surface
+from ihbench.progress import Progress
+from ihbench.scene import MaskState, TrainingSet, TrainView
+
+STATE = "stage2-painted"
+TEXELS = 128  # side of the UV grid on which the need is measured
+SIMPLE_SIZE = 128  # px, height of the crops of painters without a size of their own
+LEAST_PIXELS = 12  # of a crop; fewer are not worth a painter
+
+
+class Stage2:
+    """Paints the training views. What is done is kept by the ledger, so a killed run goes on behind it."""
+
+    def __init__(
+        self, avatar: GaussianAvatar, training: TrainingSet, config: InpaintConfig, seed: int, ledger: Ledger
+    ):
+        self.avatar, self.training, self.config, self.seed, self.ledger = avatar, training, config, seed, ledger
+
+    def run(self, progress: Progress) -> list[PaintedView]:
+        """The views that stage 3 learns from besides the training views; none where nothing needs painting."""
+        saved = self._restored()
+        if saved is not None:
+            return saved
+        with self.ledger.stage("look"):
+            surface = seen_surface(self.training, TEXELS)
+            shown = self._shown(surface)
+        if not shown:
+            reason = "every pixel's surface is shown by some training view; nothing to paint"
+            self.ledger.event("left_out", what="inpainting", reason=reason)
+            self._save([])
+            return []
+        painter, size, square = self._painter()
+        with self.ledger.stage("look"):
+            crops = {k: cut_view(view, k, self.training.body, size, square) for k, view in shown.items()}
+            crops = {k: crop for k, crop in crops.items() if crop.unknown.sum() >= LEAST_PIXELS}
+        if self.config.filler == "diffusion":
+            views = self.training.views
+            with self.ledger.stage("look"):
+                frames = [cut_view(views[k], k, self.training.body, size, square) for k in range(len(views))]
+            painter.learn(frames, progress)
+            for state, curve in painter.curves.items():
+                self.ledger.event("loss_curve", stage=state, steps=curve.steps[::5], losses=curve.losses[::5])
+        with self.ledger.stage("inpaint"):
+            ordered = list(crops.values())
+            painted = painter.inpaint(ordered, progress)
+        with self.ledger.stage("silhouette"):
+            finder = self._silhouettes()
+            silhouettes = [finder.complete(view, image) for view, image in zip(ordered, painted, strict=True)]
+        out = [
+            paste_back(shown[view.index], view, image, silhouette, self._original(view.index))
+            for view, image, silhouette in zip(ordered, painted, silhouettes, strict=True)
+        ]
+        with self.ledger.stage("measure"):
+            self._record(ordered, painted, silhouettes)
+        self._save(out)
+        return out
+
+    def _shown(self, surface: SeenSurface) -> dict[int, TrainView]:
+        """Number -> view, as the painter is shown it; numbers beyond the training views are of turntable views."""
+        training, config = self.training, self.config
+        views = training.views
+        if config.context == "frame":
+            hidden = [k for k in range(len(views)) if (views[k].mask == MaskState.UNKNOWN).any()]
+            keys = set(key_views(surface.faced, np.ones(len(surface.views), bool), config.key_views))
+            return {k: views[k] for k in hidden if k in keys}
+        chosen = key_views(surface.faced, surface.unseen, config.key_views)
+        shown = {k: with_known_surface(views[k], training, self.avatar, surface) for k in chosen}
+        clearest = min(range(len(views)), key=lambda k: int((views[k].mask == MaskState.UNKNOWN).sum()))
+        for turn in range(config.turntable):
+            angle = 2 * np.pi * turn / config.turntable
+            like = views[clearest]
+            shown[len(views) + turn] = turntable_view(angle, like, training, self.avatar, surface)
+        return {k: view for k, view in shown.items() if (view.mask == MaskState.UNKNOWN).any()}
+
+    def _painter(self) -> tuple[Any, int, bool]:
+        """The painter, the height of its crops in px, and whether they must be square."""
+        config = self.config
+        if config.filler != "diffusion":
+            from ihbench.methods.inpainthuman.inpainting.fillers import fillers
+
+            simple: Inpainter = fillers(self.training.body, self.training.background)[config.filler]
+            return simple, SIMPLE_SIZE, False
+        from ihbench.methods.inpainthuman.inpainting.diffusion_inpainter import DiffusionInpainter, load_backbone
+
+        with self.ledger.stage("load"):
+            backbone = load_backbone(config, str(self.avatar.device))
+        return DiffusionInpainter(backbone, config, self.seed, self.ledger), backbone.size, backbone.square
+
+    def _silhouettes(self) -> Any:
+        from ihbench.methods.inpainthuman.inpainting.complete_silhouette import silhouette_finder
+
+        device = str(self.avatar.device)
+        return silhouette_finder(self.config.silhouette, self.training.background, self.config.sam_weights, device)
+
+    def _original(self, index: int) -> TrainView | None:
+        return self.training.views[index] if index < len(self.training.views) else None
+
+    def _record(
+        self, views: list[CropView], painted: list[NDArray[np.uint8]], silhouettes: list[NDArray[np.bool_]]
+    ) -> None:
+        """What the paper claims of its paintings, measured, and a picture of them."""
+        from ihbench.methods.inpainthuman.inpainting.drift import flicker, identity_drift
+
+        body = self.training.body
+        self.ledger.event(
+            "inpainted",
+            views=len(views),
+            of=len(self.training.views),
+            pixels=int(sum(view.unknown.sum() for view in views)),
+            identity_drift=identity_drift(views, painted, body),
+            flicker=flicker(views, painted, body),
+        )
+        if self.ledger.folder is not None:
+            from ihbench.atomic import write_bytes
+            from ihbench.methods.inpainthuman.inpainting.grid import painted_grid, png
+
+            write_bytes(self.ledger.folder / "inpainting.png", png(painted_grid(views, painted, silhouettes)))
+
+    # --- resume ---
+
+    def _save(self, painted: list[PaintedView]) -> None:
+        tensors: dict[str, Any] = {"none": np.zeros(1, np.uint8)}
+        for n, view in enumerate(painted):
+            tensors |= {f"{n}.image": view.view.image, f"{n}.mask": view.view.mask}
+            tensors |= {f"{n}.generated": view.generated.astype(np.uint8)}
+            camera, pose = view.view.camera, view.view.body_pose
+            tensors |= {f"{n}.K": camera.K, f"{n}.R": camera.R, f"{n}.t": camera.t}
+            tensors |= {f"{n}.pose": pose.pose, f"{n}.betas": pose.betas, f"{n}.transl": pose.transl}
+        rows = [[view.index, view.view.frame, view.view.camera_id] for view in painted]
+        self.ledger.save_state(STATE, tensors, {"views": rows})
+
+    def _restored(self) -> list[PaintedView] | None:
+        from ihbench.camera import Camera
+        from ihbench.scene import BodyPose
+
+        saved = self.ledger.load_state(STATE)
+        if saved is None:
+            return None
+        tensors, meta = saved
+        out = []
+        for n, (index, frame, camera_id) in enumerate(meta["views"]):
+            part = {name: np.asarray(tensors[f"{n}.{name}"]) for name in
+                    ("image", "mask", "generated", "K", "R", "t", "pose", "betas", "transl")}  # fmt: skip
+            height, width = part["mask"].shape
+            camera = Camera(part["K"], part["R"], part["t"], width, height)
+            pose = BodyPose(part["pose"], part["betas"], part["transl"])
+            view = TrainView(part["image"], part["mask"], camera, pose, int(frame), str(camera_id))
+            out.append(PaintedView(int(index), view, part["generated"].astype(bool)))
+        self.ledger.event("resumed", stage=STATE, step=len(out))
+        return out

@@ -1,0 +1,153 @@
+"""Stage 3, canonical refinement (sec. 3.4): go on fitting, now also to what was painted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ihbench.errors import BadInput
+from ihbench.ledger import Ledger
+from ihbench.methods.inpainthuman.avatar import GaussianAvatar
+from ihbench.methods.inpainthuman.inpainting.painted_view import PaintedView
+from ihbench.methods.inpainthuman.optimisation import Optimisation
+from ihbench.methods.inpainthuman.refine_config import RefineConfig
+from ihbench.methods.inpainthuman.refine_loss import (
+    PaintedTarget,
+    Perceptual,
+    load_perceptual,
+    prepare_painted,
+    refine_loss,
+)
+from ihbench.methods.inpainthuman.stage1 import (
+    TARGETS_HELD,
+    Target,
+    body_window,
+    draw,
+    initial_loss,
+    prepare_target,
+)
+from ihbench.progress import Progress
+from ihbench.scene import MaskState, TrainingSet, TrainView
+from ihbench.views import LazyViews
+
+STATE = "stage3"
+
+
+def completed_view(
+    index: int,
+    view: TrainView,
+    image: NDArray[np.uint8],  # [H, W, 3]; only its hidden pixels are taken
+    full: NDArray,  # [H, W] the complete person mask, non-zero for person; only its hidden pixels are taken
+) -> PaintedView:
+    """A training view whose every hidden pixel is believed: the original where it is visible, `image` elsewhere.
+
+    Raises `BadInput` for another size than the view's.
+    """
+    if image.shape != view.image.shape or full.shape != view.mask.shape:
+        raise BadInput(
+            f"completed view {index}: image {image.shape} and mask {full.shape}, expected {view.image.shape} and "
+            f"{view.mask.shape}, the training view's"
+        )
+    hidden = view.mask == MaskState.UNKNOWN
+    found = np.where(np.asarray(full) > 0, MaskState.PERSON, MaskState.BACKGROUND).astype(np.uint8)
+    shown = np.where(hidden[..., None], image, view.image)
+    mask = np.where(hidden, found, view.mask)
+    return PaintedView(index, TrainView(shown, mask, view.camera, view.body_pose, view.frame, view.camera_id), hidden)
+
+
+@dataclass(frozen=True)
+class RefineTarget:
+    """What one step needs: the view as it was taken, and as it was painted, in one window."""
+
+    original: Target  # all UNKNOWN for a view that was never taken
+    painted: PaintedTarget
+
+
+class Stage3(Optimisation):
+    """Each step draws one view and adds the refinement loss to stage 1's, which keeps the visible pixels.
+
+    `painted` are training views by their index, at most one each, and views that were never taken, by any index
+    beyond the training views'. A training view that was not painted enters the refinement with its visible pixels.
+    The pose residual stays as stage 1 left it. Steps are counted on from stage 1's. `config` is the avatar's own
+    unless given. Raises `BadInput` when two paintings are of one training view, or one is not of its view's size.
+    """
+
+    name, title = STATE, "stage 3"
+
+    def __init__(
+        self,
+        avatar: GaussianAvatar,
+        training: TrainingSet,
+        painted: Sequence[PaintedView],
+        seed: int,
+        ledger: Ledger,
+        config: RefineConfig | None = None,
+    ):
+        n = len(training.views)
+        self.config = config = avatar.config.refine if config is None else config
+        self._painted = {view.index: view for view in painted if view.index < n}
+        self._others = [view for view in painted if view.index >= n]
+        if len(self._painted) + len(self._others) < len(painted) or min(self._painted, default=0) < 0:
+            raise BadInput(f"stage 3: expected one painted view per training view, got {[v.index for v in painted]}")
+        super().__init__(
+            avatar,
+            training,
+            seed,
+            ledger,
+            steps=config.steps,
+            views=n + len(self._others),
+            first_step=avatar.config.steps,
+            lr_share=config.lr_share,
+        )
+        self._targets = LazyViews(self._target, self.views, held=TARGETS_HELD)
+        self._perceptual: Perceptual | None = None
+
+    def run(self, progress: Progress) -> None:
+        """As `Optimisation.run`; an event says so when LPIPS is wanted and its weights are missing."""
+        if self.config.steps > 0:
+            perceptual = load_perceptual(self.config, self.avatar.device)
+            if isinstance(perceptual, str):
+                self.ledger.event("left_out", what="lpips term", reason=perceptual)
+            else:
+                self._perceptual = perceptual
+        super().run(progress)
+
+    def _loss(self, k: int) -> Tensor:
+        target, background = self._targets[k], self.training.background
+        drawn = draw(self.avatar, target.original, background)
+        loss = initial_loss(self.avatar, drawn, target.original)
+        if self.config.weight > 0:
+            refined = refine_loss(drawn.rgb, target.painted, self.config, self._perceptual)
+            loss = loss + self.config.weight * refined
+        return loss
+
+    def _target(self, k: int) -> RefineTarget:
+        n = len(self.training.views)
+        if k >= n:
+            painted = self._others[k - n]
+            view = _never_taken(painted.view)
+        else:
+            view = self.training.views[k]
+            painted = self._painted.get(k) or PaintedView(k, view, np.zeros(view.mask.shape, bool))
+            if painted.view.image.shape != view.image.shape:
+                raise BadInput(
+                    f"painted view {k}: has shape {painted.view.image.shape}, expected {view.image.shape}, the "
+                    f"training view's"
+                )
+        x0, y0, width, height = body_window(view.camera, self.avatar.body.pose(view.body_pose, blend_shapes=False))
+        rows, cols = slice(y0, y0 + height), slice(x0, x0 + width)
+        background, device = self.training.background, self.avatar.device
+        return RefineTarget(
+            prepare_target(self.avatar, view),
+            prepare_painted(painted, rows, cols, background, self.config.generated, device),
+        )
+
+
+def _never_taken(view: TrainView) -> TrainView:
+    """The view without anything that stage 1's loss could count."""
+    mask = np.full_like(view.mask, MaskState.UNKNOWN)
+    return TrainView(view.image, mask, view.camera, view.body_pose, view.frame, view.camera_id)

@@ -1,0 +1,74 @@
+"""What runs painted, and what is claimed of it: identity drift, flicker, and what each stage cost."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ihbench.results import RunResult
+
+EVENT = "inpainted"
+
+
+def inpainting_section(labelled: Mapping[str, Sequence[RunResult]]) -> list[str]:
+    """A table over the runs that painted something; nothing without any."""
+    found = {label: [e for run in runs for e in _painted(run)] for label, runs in labelled.items()}
+    found = {label: events for label, events in found.items() if events}
+    if not found:
+        return []
+    lines = [
+        "",
+        "### Inpainting",
+        "",
+        "| method | runs | views painted | pixels | drift ΔE (floor) | texture (floor) | flicker (floor) |",
+        "|---|---:|---:|---:|---:|---:|---:|",
+    ]
+    for label, events in found.items():
+        drifts = [event["identity_drift"] for event in events]
+        flickers = [event["flicker"] for event in events]
+        cells = [
+            str(len(events)),
+            f"{_mean(events, 'views'):.0f} of {_mean(events, 'of'):.0f}",
+            f"{_mean(events, 'pixels'):.0f}",
+            _pair(drifts, "delta_e", "delta_e_floor", 1),
+            _pair(drifts, "texture", "texture_floor", 1),
+            _pair(flickers, "deviation", "deviation_floor", 3),
+        ]
+        lines.append(f"| {label} | {' | '.join(cells)} |")
+    return [
+        *lines,
+        "",
+        "Drift: painted surface against the mean of what other views show of it; flicker: standard deviation of "
+        "painted surface over views. Floors: the same for surface that was seen, lighting and resampling alone.",
+    ]
+
+
+def stage_lines(runs: Sequence[RunResult]) -> list[str]:
+    """One line per run that has stages inside its fit: their seconds."""
+    lines = []
+    for run in runs:
+        stages = (run.record.get("ledger") or {}).get("stages", {})
+        inner = {path[4:]: stage["seconds"] for path, stage in stages.items() if path.startswith("fit/")}
+        told = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in inner.items() if "/" not in name)
+        if "stage2" in inner:
+            lines.append(f"- fit of {run.scene}, seed {run.identity['seed']}: {told}")
+    return lines
+
+
+def _painted(run: RunResult) -> list[dict[str, Any]]:
+    events = (run.record.get("ledger") or {}).get("events", [])
+    return [event["data"] for event in events if event["kind"] == EVENT][-1:]  # the last, if a run was resumed
+
+
+def _mean(rows: Sequence[Mapping[str, Any]], name: str) -> float:
+    """The mean of the finite values; NaN without any."""
+    values = [float(row[name]) for row in rows if row[name] is not None and math.isfinite(float(row[name]))]
+    return math.fsum(values) / len(values) if values else math.nan
+
+
+def _pair(rows: Sequence[Mapping[str, Any]], name: str, floor: str, digits: int) -> str:
+    value, below = _mean(rows, name), _mean(rows, floor)
+    if math.isnan(value):
+        return "absent"
+    return f"{value:.{digits}f} ({below:.{digits}f})" if math.isfinite(below) else f"{value:.{digits}f}"

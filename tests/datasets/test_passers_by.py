@@ -1,0 +1,88 @@
+"""Procedural people to train on: varied, described rightly, and none of the stand-ins."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ihbench import registry
+from ihbench.body import load_body
+from ihbench.datasets.standin import passers_by
+from ihbench.datasets.standin.subject import Subject
+
+
+@pytest.fixture(scope="module")
+def body():
+    return load_body()
+
+
+@pytest.fixture(scope="module")
+def one(body):
+    return passers_by.meet(3, body, 4)
+
+
+def test_a_passer_by_is_a_pure_function_of_their_number(body, one):
+    again = passers_by.meet(3, body, 4)
+    assert again.phrases == one.phrases
+    for a, b in zip(one.snapshots, again.snapshots, strict=True):
+        assert (a.image == b.image).all()
+    assert (passers_by.meet(4, body, 1).snapshots[0].image.shape != one.snapshots[0].image.shape) or (
+        passers_by.meet(4, body, 1).snapshots[0].image != one.snapshots[0].image
+    ).any()
+
+
+def test_snapshots_show_a_whole_person_on_white(one):
+    for shot in one.snapshots:
+        rows, cols = np.nonzero(shot.silhouette)
+        assert 100 < np.ptp(rows) < 300
+        assert rows.min() > 0
+        assert cols.min() > 0
+        assert (shot.image[0] == 255).all()
+        assert shot.image[shot.silhouette].mean() < 220
+
+
+def test_captions_use_known_words_only(body):
+    known = set(passers_by.vocabulary())
+    rng = np.random.default_rng(5)
+    for _ in range(200):
+        style = passers_by.draw_style(rng)
+        words = " ".join(passers_by.phrases(style)).split()
+        assert set(words) <= known
+        assert passers_by.traits(style).shape == (passers_by.N_TRAITS,)
+        assert np.isfinite(passers_by.traits(style)).all()
+
+
+def test_outfits_vary():
+    rng = np.random.default_rng(6)
+    styles = [passers_by.draw_style(rng) for _ in range(120)]
+    assert {style.top for style in styles} == set(passers_by.TOPS)
+    assert {style.top_pattern for style in styles} == set(passers_by.PATTERNS)
+    tops = np.array([style.top_colours[0] for style in styles])
+    assert (tops.std(0) > 0.15).all()
+
+
+def test_captions_name_the_colour(body):
+    style = passers_by.draw_style(np.random.default_rng(1))
+    from dataclasses import replace
+
+    navy = replace(style, bottom="jeans", bottom_colours=(passers_by.COLOURS["navy"], style.skin), leg=1.95)
+    assert "long navy jeans" in passers_by.phrases(navy)
+
+
+def test_no_stand_in_is_among_them(body):
+    """The split that the model card states: stand-ins come from streams of their own."""
+    styles = [passers_by.draw_style(np.random.default_rng([*passers_by.STREAM, n])) for n in range(1600)]
+    drawn = {style.seed for style in styles}
+    cast = [Subject(seed, number, body) for seed in range(10) for number in range(1, 13)]
+    assert not drawn & {subject.style.seed for subject in cast}
+    assert not {style.top_colours for style in styles} & {subject.style.top_colours for subject in cast}
+
+
+def test_is_registered():
+    assert registry.load("people", "procedural").meet is passers_by.meet
+
+
+@pytest.mark.parametrize(("number", "count"), [(-1, 1), (0, 0)])
+def test_refuses_nobody(body, number, count):
+    with pytest.raises(ValueError, match="passer-by"):
+        passers_by.meet(number, body, count)

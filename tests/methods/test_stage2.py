@@ -1,0 +1,203 @@
+"""Stage 2: what is asked of the painter, what is believed of it, and that a killed run goes on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ihbench.body.uv import texel_table
+from ihbench.ledger import Ledger
+from ihbench.methods.inpainthuman import stage2
+from ihbench.methods.inpainthuman.inpainting.crop_view import cut_view
+from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
+from ihbench.methods.inpainthuman.inpainting.painted_view import paste_back
+from ihbench.methods.inpainthuman.inpainting.shown_view import orbit, turntable_view, with_known_surface
+from ihbench.methods.inpainthuman.inpainting.surface_need import SeenSurface, key_views, seen_surface, unseen_pixels
+from ihbench.methods.inpainthuman.stage2 import Stage2
+from ihbench.progress import Progress
+from ihbench.scene import MaskState
+from tests.bench.fake_capture import a_camera, a_pose, the_body, train_view
+from tests.methods.tiny_fit import SIZE, an_avatar, one_thread, shaken, training_set, training_views
+
+QUIET = Progress.silent()
+HIDDEN = slice(28, 36)
+SIMPLE = InpaintConfig(filler="mean", key_views=0)
+
+
+@pytest.fixture(autouse=True)
+def threads():
+    with one_thread():
+        yield
+
+
+def one_sided(hidden=HIDDEN):
+    """Three views of the front, the strip in all of them: the middle of the front is hidden, the back never seen."""
+    return training_set([train_view(a_camera(0.0, SIZE), a_pose(0.0, 0.1 * k), hidden, frame=k) for k in range(3)])
+
+
+def red(view, at):
+    """A view whose image is red where `at`."""
+    return np.where(at[..., None], np.array([255, 0, 0], np.uint8), view.image)
+
+
+class TestNeed:
+    def test_a_strip_that_never_moves_hides_its_surface(self):
+        training = one_sided()
+        surface = seen_surface(training, 64)
+        view = training.views[0]
+        unseen = unseen_pixels(the_body().pose(view.body_pose), the_body(), view.camera, surface)
+        hidden, body = view.mask == MaskState.UNKNOWN, view.mask == MaskState.PERSON
+        assert unseen[hidden].sum() > 40
+        assert not unseen[body].mean() > 0.05  # the rim is seen too obliquely to count
+
+    def test_nothing_is_needed_where_another_view_shows_it(self):
+        views = [*one_sided().views, train_view(a_camera(0.0, SIZE), a_pose(0.0, 0.0), None, frame=9)]
+        surface = seen_surface(training_set(views), 64)
+        view = views[0]
+        unseen = unseen_pixels(the_body().pose(view.body_pose), the_body(), view.camera, surface)
+        hidden = view.mask == MaskState.UNKNOWN
+        assert (unseen & hidden).sum() < 0.1 * hidden.sum()
+
+    def test_a_body_nowhere_in_the_image(self):
+        training = one_sided()
+        surface = seen_surface(training, 64)
+        away = the_body().pose(a_pose(0.0, 0.0)) + np.array([50.0, 0, 0])
+        assert not unseen_pixels(away, the_body(), training.views[0].camera, surface).any()
+
+    def test_key_views_cover_every_needed_texel(self):
+        faced = [np.arange(0, 10), np.arange(0, 10), np.arange(5, 20), np.arange(18, 30), np.arange(0, 0)]
+        needed = np.ones(30, bool)
+        chosen = key_views(faced, needed, 3)
+        assert len(chosen) == 3
+        assert set(np.concatenate([faced[k] for k in chosen])) == set(range(30))
+        assert key_views(faced, needed, 0) == [0, 1, 2, 3]
+        assert key_views(faced, np.zeros(30, bool), 0) == []
+
+
+class TestShown:
+    def test_only_unseen_surface_stays_unknown(self):
+        views = training_views()
+        training = training_set(views)
+        surface = seen_surface(training, 64)
+        avatar = shaken(an_avatar())
+        shown = with_known_surface(views[1], training, avatar, surface)
+        was, is_now = views[1].mask == MaskState.UNKNOWN, shown.mask == MaskState.UNKNOWN
+        assert is_now.sum() < was.sum()
+        assert not (is_now & ~was).any()
+        assert (shown.image[~was] == views[1].image[~was]).all()
+        rgb, _ = avatar.render(views[1].camera, views[1].body_pose, training.background)
+        drawn = was & ~is_now
+        np.testing.assert_array_equal(shown.image[drawn], np.rint(rgb[drawn] * 255).astype(np.uint8))
+
+    def test_a_turntable_view_asks_for_the_side_nobody_filmed(self):
+        training = one_sided(hidden=None)
+        surface = seen_surface(training, 64)
+        avatar = an_avatar()
+        front, back = (turntable_view(angle, training.views[0], training, avatar, surface) for angle in (0.0, np.pi))
+        body = [(view.mask != MaskState.BACKGROUND).sum() for view in (front, back)]
+        asked = [(view.mask == MaskState.UNKNOWN).sum() for view in (front, back)]
+        assert asked[0] < 0.25 * body[0]
+        assert asked[1] > 0.75 * body[1]
+
+    def test_an_orbit_keeps_the_distance_and_turns_right_round(self):
+        camera, pose = a_camera(0.0, SIZE), a_pose(0.4, 0.2)
+        pelvis = the_body().shaped(pose.betas)[1][0] + pose.transl
+        for angle in (0.5, 2.0, np.pi):
+            turned = orbit(camera, pose, the_body(), angle)
+            np.testing.assert_allclose(turned.to_camera(pelvis), camera.to_camera(pelvis), atol=1e-9)
+            np.testing.assert_allclose(turned.R @ turned.R.T, np.eye(3), atol=1e-12)
+        np.testing.assert_allclose(orbit(camera, pose, the_body(), 2 * np.pi).R, camera.R, atol=1e-9)
+        assert np.linalg.norm(orbit(camera, pose, the_body(), np.pi).center - camera.center) > 2
+
+
+class TestBelieved:
+    def setup_method(self):
+        self.view = one_sided().views[0]
+        self.crop = cut_view(self.view, 0, the_body(), 64)
+
+    def test_the_original_stays_and_the_painted_joins(self):
+        painted = red(self.crop, self.crop.unknown)
+        done = paste_back(self.view, self.crop, painted, self.crop.body, self.view)
+        known = self.view.mask != MaskState.UNKNOWN
+        assert (done.view.image[known] == self.view.image[known]).all()
+        assert (done.view.mask[known] == self.view.mask[known]).all()
+        inside = done.generated & (done.view.mask == MaskState.PERSON)
+        middle = inside & np.roll(inside, 2, 1) & np.roll(inside, -2, 1)
+        assert middle.any()
+        assert (done.view.image[middle] == (255, 0, 0)).mean() > 0.95
+        assert not (done.generated & known).any()
+
+    def test_hidden_pixels_that_nobody_was_asked_about_stay_unknown(self):
+        asked = self.view.mask.copy()
+        rows = np.arange(SIZE)[:, None] < SIZE // 2
+        asked[(asked == MaskState.UNKNOWN) & rows] = MaskState.PERSON
+        shown = replace(self.view, mask=asked)
+        crop = cut_view(shown, 0, the_body(), 64)
+        done = paste_back(shown, crop, crop.image, crop.body, self.view)
+        upper = (self.view.mask == MaskState.UNKNOWN) & rows
+        assert (done.view.mask[upper] == MaskState.UNKNOWN).all()
+        assert not done.generated[upper].any()
+
+    def test_of_a_turntable_view_only_the_painted_is_believed(self):
+        done = paste_back(self.view, self.crop, self.crop.image, self.crop.body, None)
+        assert ((done.view.mask != MaskState.UNKNOWN) == done.generated).all()
+
+
+class TestStage2:
+    def test_paints_and_resumes_without_painting_again(self, tmp_path, monkeypatch):
+        training, avatar = one_sided(), shaken(an_avatar(), 0.05)
+        first = Stage2(avatar, training, SIMPLE, 0, Ledger(tmp_path)).run(QUIET)
+        assert len(first) == 3
+        assert (tmp_path / "inpainting.png").is_file()
+        monkeypatch.setattr(Stage2, "_painter", None)
+        again = Stage2(avatar, training, SIMPLE, 0, Ledger(tmp_path)).run(QUIET)
+        for a, b in zip(first, again, strict=True):
+            assert a.index == b.index
+            assert (a.view.image == b.view.image).all()
+            assert (a.view.mask == b.view.mask).all()
+            assert (a.generated == b.generated).all()
+            np.testing.assert_array_equal(a.view.camera.K, b.view.camera.K)
+            np.testing.assert_array_equal(a.view.body_pose.pose, b.view.body_pose.pose)
+
+    def test_nothing_hidden_loads_no_painter(self, monkeypatch):
+        monkeypatch.setattr(Stage2, "_painter", None)
+        ledger = Ledger()
+        assert Stage2(an_avatar(), one_sided(hidden=None), SIMPLE, 0, ledger).run(QUIET) == []
+        assert [event["data"]["what"] for event in ledger.events] == ["inpainting"]
+
+    def test_context_frame_asks_for_every_hidden_pixel(self):
+        training = training_set()
+        config = replace(SIMPLE, context="frame")
+        painted = Stage2(an_avatar(), training, config, 0, Ledger()).run(QUIET)
+        hiding = [k for k, view in enumerate(training.views) if (view.mask == MaskState.UNKNOWN).any()]
+        assert [view.index for view in painted] == hiding
+        for view in painted:
+            hidden = training.views[view.index].mask == MaskState.UNKNOWN
+            assert (view.generated & hidden).sum() > 0.5 * hidden.sum()
+
+    def test_what_is_claimed_is_in_the_record(self):
+        ledger = Ledger()
+        Stage2(an_avatar(), one_sided(), SIMPLE, 0, ledger).run(QUIET)
+        (event,) = [event for event in ledger.events if event["kind"] == "inpainted"]
+        assert event["data"]["views"] == 3
+        assert event["data"]["pixels"] > 0
+        assert {"identity_drift", "flicker"} <= set(event["data"])
+        assert {"look", "inpaint", "silhouette", "measure"} <= set(ledger.state()["stages"])
+
+    def test_turntable_views_follow_the_training_views(self):
+        config = replace(SIMPLE, turntable=3)
+        painted = Stage2(an_avatar(), one_sided(), config, 0, Ledger()).run(QUIET)
+        assert {view.index for view in painted} >= {3, 4, 5} - {3}
+        assert all(view.view.frame == -1 for view in painted if view.index >= 3)
+
+
+def test_seen_map_reaches_beyond_the_charts():
+    surface = seen_surface(one_sided(), 64)
+    assert isinstance(surface, SeenSurface)
+    table = texel_table(the_body(), 64)
+    on = table.mask
+    assert (surface.map[on] == (surface.views > 0)).all()
+    assert surface.map[~on].any()
+    assert stage2.TEXELS >= 64

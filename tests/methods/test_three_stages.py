@@ -1,0 +1,150 @@
+"""InpaintHuman whole: fit, paint, refine; with either backbone, switched off, killed and resumed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ihbench.ledger import Ledger
+from ihbench.methods.inpainthuman.config import QUICK, InpaintHumanConfig, config_from, outside_files
+from ihbench.methods.inpainthuman.inpainting.mini_weights import save_mini
+from ihbench.methods.inpainthuman.inpainting.personalise import ADAPT_STATE, TI_STATE
+from ihbench.methods.inpainthuman.method import InpaintHuman
+from ihbench.progress import Progress
+from tests.bench.fake_capture import a_camera, a_pose, train_view
+from tests.methods.sd2_miniature import make_miniature
+from tests.methods.tiny_diffusion import tiny_backbone
+from tests.methods.tiny_fit import SIZE, TINY, equal_bits, one_thread, parameters_of, training_set
+
+QUIET = Progress.silent()
+
+
+@pytest.fixture(autouse=True)
+def threads():
+    with one_thread():
+        yield
+
+
+@pytest.fixture(scope="module")
+def mini(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("mini")
+    save_mini(tiny_backbone(), folder)
+    return folder
+
+
+def config(weights, **inpaint) -> InpaintHumanConfig:
+    stage2 = replace(
+        QUICK.inpaint,
+        weights=str(weights),
+        ti_steps=3,
+        lora_steps=3,
+        batch=2,
+        sampler_steps=2,
+        key_views=2,
+        **inpaint,
+    )
+    return replace(TINY, inpaint=stage2, refine=replace(QUICK.refine, steps=4, lpips=0.0))
+
+
+def hidden_person():
+    """A strip that never moves, before a person who turns a little."""
+    views = [train_view(a_camera(0.0, SIZE), a_pose(0.1 * k, 0.1 * k), slice(28, 36), frame=k) for k in range(4)]
+    return training_set(views)
+
+
+def fit(config, ledger=None, seed=0):
+    return InpaintHuman(config).fit(
+        hidden_person(), device="cpu", seed=seed, ledger=ledger or Ledger(), progress=QUIET
+    )
+
+
+def test_off_is_stage_1_exactly(mini):
+    ledger = Ledger()
+    off = fit(replace(TINY), ledger)
+    assert set(ledger.state()["stages"]) == {"fit", "fit/prepare", "fit/stage1", "checkpoint"}
+    on = fit(config(mini))
+    assert not equal_bits(parameters_of(on), parameters_of(off))
+    unrefined = fit(replace(config(mini), refine=replace(QUICK.refine, steps=0)))
+    assert equal_bits(parameters_of(unrefined), parameters_of(off))
+
+
+def test_all_three_stages_are_in_the_ledger_and_repeat_bit_for_bit(mini):
+    ledger = Ledger()
+    first = fit(config(mini), ledger)
+    stages = set(ledger.state()["stages"])
+    inside = ("look", "load", "textual-inversion", "adapt", "inpaint", "silhouette", "measure")
+    assert {f"fit/stage2/{name}" for name in inside} | {"fit/stage3"} <= stages
+    kinds = [event["kind"] for event in ledger.events]
+    assert "inpainted" in kinds
+    curves = {event["data"]["stage"] for event in ledger.events if event["kind"] == "loss_curve"}
+    assert curves == {TI_STATE, ADAPT_STATE}
+    assert equal_bits(parameters_of(first), parameters_of(fit(config(mini))))
+    assert not equal_bits(parameters_of(first), parameters_of(fit(config(mini), seed=1)))
+
+
+@pytest.mark.parametrize("filler", ["mean", "telea", "navier-stokes", "push-pull", "mirror", "temporal"])
+def test_every_simple_filler_runs_without_diffusers(filler, monkeypatch):
+    from ihbench.methods.inpainthuman.stage2 import Stage2
+
+    painters = []
+    honest = Stage2._painter
+    monkeypatch.setattr(Stage2, "_painter", lambda self: painters.append(honest(self)) or painters[-1])
+    fit(config("", filler=filler))
+    assert [painter[0].name for painter in painters] == [filler]
+
+
+class Killed(BaseException):
+    pass
+
+
+@pytest.mark.parametrize("state", [TI_STATE, ADAPT_STATE, "stage2-painted", "stage3"])
+def test_killed_in_any_stage_and_resumed_ends_the_same(tmp_path, mini, state, monkeypatch):
+    """Killed right after that state was saved; everything before it is not done again."""
+    whole = fit(config(mini))
+    ledger = Ledger(tmp_path)
+    monkeypatch.setattr(ledger, "due_to_save", lambda: True)
+    honest = ledger.save_state
+
+    def save(name, tensors, meta):
+        honest(name, tensors, meta)
+        if name == state:
+            raise Killed
+
+    monkeypatch.setattr(ledger, "save_state", save)
+    with pytest.raises(Killed):
+        fit(config(mini), ledger)
+    again = Ledger(tmp_path)
+    resumed = fit(config(mini), again)
+    assert equal_bits(parameters_of(resumed), parameters_of(whole))
+    assert state in [event["data"]["stage"] for event in again.events if event["kind"] == "resumed"]
+
+
+def test_the_miniature_of_stable_diffusion_2_goes_the_whole_way(tmp_path):
+    make_miniature(tmp_path)
+    given = config(tmp_path, backbone="sd2", token="<someone>")
+    ledger = Ledger()
+    avatar = fit(given, ledger)
+    (event,) = [event for event in ledger.events if event["kind"] == "inpainted"]
+    assert event["data"]["pixels"] > 0
+    assert np.isfinite(avatar.render(a_camera(0.0, SIZE), a_pose(0.0, 0.0))[0]).all()
+    curve = next(e["data"] for e in ledger.events if e["kind"] == "loss_curve" and e["data"]["stage"] == ADAPT_STATE)
+    assert np.isfinite(curve["losses"]).all()
+    assert given.inpaint.settled().vectors == 1
+
+
+def test_an_avatar_remembers_its_whole_configuration(tmp_path, mini):
+    from dataclasses import asdict
+
+    given = config(mini, tune="lora")
+    assert config_from(asdict(given)) == given
+    avatar = fit(replace(given, refine=replace(given.refine, steps=1)))
+    avatar.save(tmp_path)
+    assert InpaintHuman(QUICK).load(tmp_path, avatar.body).config == avatar.config
+
+
+def test_weights_outside_the_package_are_part_of_a_runs_identity(mini):
+    assert outside_files(config(mini)) == [mini]
+    assert outside_files(config(mini, filler="mean")) == []
+    assert outside_files(QUICK) == []

@@ -1,0 +1,171 @@
+"""`ihbench train-mini`: an interrupted training ends like an uninterrupted one, and its backbone can be loaded."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from ihbench.cli import main
+from ihbench.errors import BadInput
+from ihbench.methods.inpainthuman.inpainting import crop_album, mini_model, mini_validation, mini_weights, train_mini
+from ihbench.methods.inpainthuman.inpainting.crop_album import CropAlbum
+from ihbench.methods.inpainthuman.inpainting.mini_training import MiniTraining
+from ihbench.methods.inpainthuman.inpainting.mini_weights import load_mini, save_mini
+from ihbench.methods.inpainthuman.inpainting.train_mini import MiniTrainer, curve_of
+from ihbench.progress import Progress
+from tests.methods.tiny_diffusion import same, tiny_backbone, weights
+from tests.methods.tiny_fit import one_thread
+
+QUIET = Progress.silent()
+SMALL = MiniTraining(people=2, each=2, steps=4)
+SIDE = 64  # px
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    """Two people a page, tiny networks and crops."""
+    monkeypatch.setattr(mini_model, "CHANNELS", (32, 32, 32))
+    for module in (crop_album, train_mini, mini_validation):
+        monkeypatch.setattr(module, "PAGE", 2)
+    for module in (mini_model, train_mini, mini_weights):
+        monkeypatch.setattr(module, "SIZE", SIDE)
+    monkeypatch.setattr(train_mini, "PIXELS", 2 * SIDE * SIDE)
+    monkeypatch.setattr(mini_validation, "PEOPLE", 2)
+    with one_thread():
+        yield
+
+
+@pytest.fixture(scope="module")
+def album(tmp_path_factory):
+    return tmp_path_factory.mktemp("album")
+
+
+class Killed(Exception):
+    pass
+
+
+def test_killed_and_resumed_ends_the_same(tmp_path, album, monkeypatch):
+    whole = MiniTrainer(SMALL, tmp_path / "whole", album, QUIET)
+    whole.run()
+    part = MiniTrainer(SMALL, tmp_path / "part", album, QUIET)
+    honest = part._one_step
+
+    def step():
+        if part.step == 2:
+            part.save()
+            raise Killed
+        return honest()
+
+    monkeypatch.setattr(part, "_one_step", step)
+    with pytest.raises(Killed):
+        part.run()
+    again = MiniTrainer(SMALL, tmp_path / "part", album, QUIET)
+    assert again.step == 2
+    again.run()
+    for name in train_mini.TRAINED:
+        assert same(weights(again.modules[name]), weights(whole.modules[name])), name
+    assert [row["step"] for row in curve_of(tmp_path / "part")] == [4]
+
+
+def test_another_configuration_does_not_go_on(tmp_path, album):
+    trainer = MiniTrainer(SMALL, tmp_path, album, QUIET)
+    trainer._one_step()
+    trainer.step = 1
+    trainer.save()
+    from dataclasses import replace
+
+    with pytest.raises(BadInput, match="other lr"):
+        MiniTrainer(replace(SMALL, lr=1e-3), tmp_path, album, QUIET)
+    assert MiniTrainer(replace(SMALL, steps=9), tmp_path, album, QUIET).step == 1
+    (tmp_path / train_mini.STATE).write_bytes(b"damaged")
+    with pytest.raises(BadInput, match="not a readable training state"):
+        MiniTrainer(SMALL, tmp_path, album, QUIET)
+
+
+def test_people_come_in_pages(tmp_path, album):
+    with pytest.raises(BadInput, match="multiple of 2"):
+        MiniTrainer(MiniTraining(people=3, each=2), tmp_path, album, QUIET)
+
+
+def test_the_loss_sees_the_prompted_traits(tmp_path, album):
+    """Trait tokens reach the text encoder's output of told prompts alone."""
+    trainer = MiniTrainer(MiniTraining(people=2, each=2, traits=1.0, captions=0.0), tmp_path, album, QUIET)
+    rng = np.random.default_rng(0)
+    both = trainer._text(rng, np.array([0, 1]))
+    assert not torch.equal(both[0], both[1])
+    silent = MiniTrainer(MiniTraining(people=2, each=2, traits=0.0, captions=0.0), tmp_path / "b", album, QUIET)
+    both = silent._text(rng, np.array([0, 1]))
+    assert torch.equal(both[0], both[1])
+
+
+def test_album_pages_are_written_whole_and_read_back(tmp_path):
+    store = CropAlbum(tmp_path, "procedural", 2, SIDE)
+    store.make(0, 2, QUIET)
+    (page,) = store.pages(0, 2)
+    fresh = crop_album.make_page("procedural", 0, 2, 2, SIDE)
+    assert (page.images == fresh.images).all()
+    assert page.phrases == fresh.phrases
+    assert set(page.widths) <= {SIDE // 2, 5 * SIDE // 8, 3 * SIDE // 4, SIDE}
+    store.path(0).write_bytes(b"cut short")
+    with pytest.raises(BadInput, match="not a readable page"):
+        list(store.pages(0, 2))
+    with pytest.raises(BadInput, match="pages of 2"):
+        store.make(1, 2, QUIET)
+
+
+class TestWeights:
+    def test_saved_and_loaded_within_half_precision(self, tmp_path):
+        backbone = tiny_backbone()
+        before = weights(backbone.unet)
+        save_mini(backbone, tmp_path)
+        assert same(weights(backbone.unet), before)
+        loaded = load_mini(tmp_path)
+        for name, value in before.items():
+            torch.testing.assert_close(weights(loaded.unet)[name], value, atol=1e-3, rtol=1e-3)
+        assert torch.equal(loaded.token_ids(["a photo of person"]), backbone.token_ids(["a photo of person"]))
+        assert loaded.scheduler.config.prediction_type == "sample"
+        assert loaded.prefill
+        assert not any(p.requires_grad for p in loaded.unet.parameters())
+
+    def test_a_folder_that_lacks_parts(self, tmp_path):
+        with pytest.raises(BadInput, match="lacks unet, controlnet"):
+            load_mini(tmp_path)
+
+    def test_a_damaged_file(self, tmp_path):
+        save_mini(tiny_backbone(), tmp_path)
+        (tmp_path / "unet" / "diffusion_pytorch_model.safetensors").write_bytes(b"xx")
+        with pytest.raises(BadInput, match="not a readable mini backbone"):
+            load_mini(tmp_path)
+
+    def test_weights_that_are_not_finite(self, tmp_path):
+        backbone = tiny_backbone()
+        with torch.no_grad():
+            next(backbone.unet.parameters()).fill_(float("nan"))
+        save_mini(backbone, tmp_path)
+        with pytest.raises(BadInput, match="not finite"):
+            load_mini(tmp_path)
+
+
+def test_the_command_trains_validates_and_writes_a_card(tmp_path, capsys, monkeypatch, album):
+    monkeypatch.setattr(mini_validation, "STEPS", (1,))
+    words = ["train-mini", "--out", str(tmp_path), "--album", str(album), "--json", "--train.people", "2"]
+    words += ["--train.each", "2", "--train.steps", "2"]
+    assert main(words) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert {
+        "mean visible colour, silhouette given",
+        "push-pull, silhouette given",
+        "mini, 1 steps, noise 0, with parts",
+    } <= set(result["hidden_psnr"])
+    assert all(np.isfinite(value) for value in result["hidden_psnr"].values())
+    card = (tmp_path / "README.md").read_text()
+    assert "--train.people 2" in card
+    assert load_mini(tmp_path).name == "mini"
+
+
+def test_help_lists_the_commands_of_methods(capsys):
+    assert main(["--help"]) == 0
+    assert "train-mini" in capsys.readouterr().out
