@@ -20,7 +20,14 @@ from ihbench.scene import MaskState
 from ihbench.views import open_scene
 from tests.conftest import contents
 
-SWITCHES = {"texels": 32, "levels": (16, 256), "decoder_width": 32, "position_map": 16, "steps": 8}
+SWITCHES = {
+    "texels": 32,
+    "levels": (16, 256),
+    "decoder_width": 32,
+    "position_map": 16,
+    "steps": 8,
+    "inpaint.on": False,
+}
 VIEWS = 4  # test views of the tiny protocol
 
 

@@ -49,11 +49,11 @@ class BlockTransform(ModelMixin, ConfigMixin):
         self.scale.copy_(values.std(0).clamp(min=1e-3))
 
     def encode(self, images: Tensor) -> Tensor:
-        raw = conv2d(images, self.kernel, stride=self.block)
+        raw = conv2d(images.to(self.kernel.dtype), self.kernel, stride=self.block)
         return (raw - self.mean[:, None, None]) / self.scale[:, None, None]
 
     def decode(self, latents: Tensor) -> Tensor:
-        raw = latents * self.scale[:, None, None] + self.mean[:, None, None]
+        raw = latents.to(self.kernel.dtype) * self.scale[:, None, None] + self.mean[:, None, None]
         return conv_transpose2d(raw, self.kernel, stride=self.block)
 
 
