@@ -150,10 +150,11 @@ def leave_out(config: InpaintHumanConfig, scene: SceneMeasure) -> list[Omission]
 
 def config_from(words: dict[str, Any]) -> InpaintHumanConfig:
     """What `dataclasses.asdict` made, back from JSON. Raises `TypeError` for fields that do not exist."""
-    values = {name: tuple(value) if isinstance(value, list) else value for name, value in words.items()}
-    for name, kind in (("inpaint", InpaintConfig), ("refine", RefineConfig)):
-        if name in values:
-            values[name] = kind(**values[name])
+    values: dict[str, Any] = {k: tuple(value) if isinstance(value, list) else value for k, value in words.items()}
+    if "inpaint" in values:
+        values["inpaint"] = InpaintConfig(**values["inpaint"])
+    if "refine" in values:
+        values["refine"] = RefineConfig(**values["refine"])
     return InpaintHumanConfig(**values)
 
 

@@ -46,7 +46,7 @@ def prepare_painted(
     painter made."""
     image = painted.view.image[rows, cols].astype(np.float32) / 255
     mask, made = painted.view.mask[rows, cols], painted.generated[rows, cols]
-    off = np.broadcast_to(np.float32(background), image.shape)
+    off = np.broadcast_to(np.asarray(background, np.float32), image.shape)
     cleared = made & (mask == MaskState.BACKGROUND)
     weight = np.where(made, np.float32(generated), np.float32(1)) * (mask == MaskState.PERSON)
 

@@ -88,7 +88,8 @@ class Stage3(Optimisation):
         config: RefineConfig | None = None,
     ):
         n = len(training.views)
-        self.config = config = avatar.config.refine if config is None else config
+        chosen = avatar.config.refine if config is None else config
+        self.config = chosen
         self._painted = {view.index: view for view in painted if view.index < n}
         self._others = [view for view in painted if view.index >= n]
         if len(self._painted) + len(self._others) < len(painted) or min(self._painted, default=0) < 0:
@@ -98,10 +99,10 @@ class Stage3(Optimisation):
             training,
             seed,
             ledger,
-            steps=config.steps,
+            steps=chosen.steps,
             views=n + len(self._others),
             first_step=avatar.config.steps,
-            lr_share=config.lr_share,
+            lr_share=chosen.lr_share,
         )
         self._targets = LazyViews(self._target, self.views, held=TARGETS_HELD)
         self._perceptual: Perceptual | None = None

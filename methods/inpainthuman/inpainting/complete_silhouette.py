@@ -104,7 +104,8 @@ class GrabCutSilhouette:
             return rim.result(view.body)  # two colour models need two sets of pixels
         cv2.setRNGSeed(0)  # the colour models start from k-means with random centres
         models = np.zeros((1, 65)), np.zeros((1, 65))
-        cv2.grabCut(np.ascontiguousarray(image), labels, None, *models, GRABCUT_ROUNDS, cv2.GC_INIT_WITH_MASK)
+        no_box = (0, 0, 1, 1)  # the mask says it all
+        cv2.grabCut(np.ascontiguousarray(image), labels, no_box, *models, GRABCUT_ROUNDS, cv2.GC_INIT_WITH_MASK)
         return rim.result((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD))
 
 
@@ -190,7 +191,7 @@ def _distance(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
     The image's edge is no rim: a body that it cuts goes on behind it."""
     if mask.all():
         return np.full(mask.shape, np.inf, np.float32)
-    return cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.asarray(cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE), np.float32)
 
 
 def _nearest(
@@ -203,9 +204,10 @@ def _nearest(
     _, labels = cv2.distanceTransformWithLabels(
         (~where).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
-    table = np.zeros((labels.max() + 1, values.shape[2]), np.float32)
-    table[labels[where]] = smooth[where]
-    return table[labels]
+    number = np.asarray(labels, np.int64)
+    table = np.zeros((number.max() + 1, values.shape[2]), np.float32)
+    table[number[where]] = smooth[where]
+    return table[number]
 
 
 # --- HQ-SAM ---
@@ -248,9 +250,10 @@ def _load_sam(weights: str, device: str) -> tuple[Any, Any]:
     except ImportError as error:
         raise BadInput(f"silhouette 'sam' needs transformers 4.52 or newer ({error}); update it") from error
     try:
-        model, report = SamHQModel.from_pretrained(
+        loaded: Any = SamHQModel.from_pretrained(
             str(folder), local_files_only=True, use_safetensors=True, output_loading_info=True
         )
+        model, report = loaded
         processor = SamHQProcessor.from_pretrained(str(folder), local_files_only=True)
     except Exception as error:  # the libraries raise all sorts for a bad file
         first = (str(error).strip().splitlines() or [type(error).__name__])[0]

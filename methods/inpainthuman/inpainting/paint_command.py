@@ -68,10 +68,11 @@ def _paint(chosen: Any) -> int:
     protocols = chosen.apply(load_protocol(chosen.protocol, chosen.profile))
     if len(protocols) > 1:
         raise BadInput("--occlusion.fraction: one severity at a time")
-    progress, scenes = Progress(), {}
+    progress, scenes, data = Progress(), {}, ""
     source = locate(protocols[0], chosen.data, chosen.scene)
     for scene in source.scenes:
         capture, body = source.open(scene, chosen.body, progress)
+        data = capture.standin or capture.variant
         scenes[scene], picture = paint_scene(
             capture, body, protocols[0], chosen.rows, chosen.frames, chosen.seed, chosen.inpaint, progress
         )
@@ -79,7 +80,7 @@ def _paint(chosen: Any) -> int:
             write_bytes(chosen.out / f"{scene}.png", png(picture))
             write_json(chosen.out / "paint.json", {"scenes": scenes, "summary": summary(scenes)})
     result = summary(scenes)
-    text = table(result, f"{protocols[0].name}, {len(scenes)} scenes, {capture.standin or capture.variant}")
+    text = table(result, f"{protocols[0].name}, {len(scenes)} scenes, {data}")
     if chosen.out is not None:
         write_text(chosen.out / "paint.md", text + "\n")
     print(json.dumps({"scenes": scenes, "summary": result}) if chosen.json else text)

@@ -36,6 +36,7 @@ TI_SHARES = (
 )  # kinds of masks: more often everything, so that the word must say it
 BACKGROUND_WEIGHT = 0.15  # of blocks without the person
 GOOD_EVERY = 20  # steps between two copies to roll back to
+TEXT_LR = 1e-5  # of LoRA on the text encoder
 LEAST_FRAMES = 4
 TI_STATE, ADAPT_STATE = "stage2-ti", "stage2-adapt"
 ATTENTION = ["to_q", "to_k", "to_v", "to_out.0"]
@@ -81,21 +82,21 @@ class Personaliser:
 
     def _invert(self, progress: Progress) -> None:
         config = self.config
-        self.token = SubjectToken(self.backbone, config.token, self.settled.vectors)
-        named: dict[str, nn.Parameter] = {"vectors": self.token.vectors}
+        self.token = token = SubjectToken(self.backbone, config.token, self.settled.vectors)
+        named: dict[str, nn.Parameter] = {"vectors": token.vectors}
         rates = {"vectors": self.settled.ti_lr}
         if config.text_lora:
             encoder = self.backbone.text_encoder
             encoder.add_adapter(_lora(config.rank, TEXT_ATTENTION))
             added = _trainable(encoder, "text")
             named |= added
-            rates |= dict.fromkeys(added, 1e-5)
+            rates |= {name: TEXT_LR for name in added}
         best = best_seen(self.views, config.ti_frames)
         # with the part map, when there is one at inference: the word need not learn the pose
         self._optimise(
             TI_STATE, "textual inversion", named, rates, config.ti_steps, best, TI_SHARES, config.sg, progress
         )
-        self.token.vectors.requires_grad_(False)
+        token.vectors.requires_grad_(False)
 
     def _adapt(self, progress: Progress) -> None:
         config, backbone = self.config, self.backbone
@@ -108,12 +109,12 @@ class Personaliser:
                 backbone.unet.requires_grad_(True)
             added = _trainable(backbone.unet, "unet")
             named |= added
-            rates |= dict.fromkeys(added, self.settled.lora_lr)
+            rates |= {name: self.settled.lora_lr for name in added}
         if config.sg:
             backbone.controlnet.requires_grad_(True)
             added = _trainable(backbone.controlnet, "controlnet")
             named |= added
-            rates |= dict.fromkeys(added, self.settled.control_lr)
+            rates |= {name: self.settled.control_lr for name in added}
         self._optimise(
             ADAPT_STATE, "adapting", named, rates, config.lora_steps, self.views, SHARES, config.sg, progress
         )

@@ -42,7 +42,8 @@ def random_mask(
     elif kind == "patches":
         # what is left when other frames have shown the rest of the surface
         noise = gaussian_filter(rng.normal(size=(height, width)), 0.05 * (bottom - top) * rng.uniform(0.5, 2))
-        out = (noise > np.quantile(noise[person], rng.uniform(0.3, 0.85))) & binary_dilation(person, iterations=3)
+        near = np.asarray(binary_dilation(person, iterations=3), bool)
+        out = near & (noise > np.quantile(noise[person], rng.uniform(0.3, 0.85)))
     elif kind == "side":
         cut = round(rng.uniform(left + 0.25 * (right - left), right - 0.25 * (right - left)))
         out[:, :cut] = True

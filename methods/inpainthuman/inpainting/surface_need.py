@@ -74,7 +74,8 @@ def unseen_pixels(
     row = np.clip(((1 - uv[:, 1]) * size).astype(int), 0, size - 1)
     out[on] = ~surface.map[row, column]
     out = median_filter(out, size=3) & on  # a lone texel is not worth a painter
-    distance, nearest = distance_transform_edt(~on, return_indices=True)
+    nearest = distance_transform_edt(~on, return_distances=False, return_indices=True)
+    distance = distance_transform_edt(~on)
     rows = np.flatnonzero(on.any(1))
     band = BAND * (rows[-1] - rows[0] + 1)
     return np.where(on, out, out[tuple(np.asarray(nearest))] & (np.asarray(distance) <= band))

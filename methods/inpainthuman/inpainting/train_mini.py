@@ -48,8 +48,9 @@ class TraitTokens(nn.Module):
 
     def __init__(self, n_traits: int):
         super().__init__()
-        self.net = nn.Sequential(nn.Linear(n_traits, 128), nn.SiLU(), nn.Linear(128, TRAIT_TOKENS * TEXT_WIDTH))
-        nn.init.normal_(self.net[2].weight, std=0.01)
+        first, last = nn.Linear(n_traits, 128), nn.Linear(128, TRAIT_TOKENS * TEXT_WIDTH)
+        nn.init.normal_(last.weight, std=0.01)
+        self.net = nn.Sequential(first, nn.SiLU(), last)
 
     def forward(self, traits: Tensor) -> Tensor:  # [B, T] -> [B, TRAIT_TOKENS, TEXT_WIDTH]
         return self.net(traits).reshape(len(traits), TRAIT_TOKENS, TEXT_WIDTH)
