@@ -112,10 +112,16 @@ class Stage3(Optimisation):
         if self.config.steps > 0:
             perceptual = load_perceptual(self.config, self.avatar.device)
             if isinstance(perceptual, str):
-                self.ledger.event("left_out", what="lpips term", reason=perceptual)
+                self._say_once("lpips term", perceptual)
             else:
                 self._perceptual = perceptual
         super().run(progress)
+
+    def _say_once(self, what: str, reason: str) -> None:
+        """A resumed run has the event already."""
+        said = [event["data"].get("what") for event in self.ledger.events if event["kind"] == "left_out"]
+        if what not in said:
+            self.ledger.event("left_out", what=what, reason=reason)
 
     def _loss(self, k: int) -> Tensor:
         target, background = self._targets[k], self.training.background

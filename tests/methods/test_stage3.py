@@ -397,6 +397,7 @@ def test_the_lpips_term_is_the_benchs_lpips_over_the_complete_mask(networks, sha
     expected = lpips(rgb.numpy(), target.image.numpy(), inside, net="squeeze", background=BLUE, crop=whole)
     assert loss.item() - alone.item() == pytest.approx(0.5 * expected, rel=1e-4)
     loss.backward()
+    assert image.grad is not None
     assert image.grad.isfinite().all()
     assert image.grad[torch.from_numpy(inside)].any()
 
@@ -418,9 +419,10 @@ def test_without_lpips_weights_the_term_is_off_and_said_so(views, painted, monke
     training, ledger = training_set(views), Ledger()
     config = replace(REFINE, steps=3)
     without = refined(training, painted, config=config)
-    wanted = refined(training, painted, ledger=ledger, config=replace(config, lpips=0.1))
-    assert equal_bits(parameters_of(without), parameters_of(wanted))
-    (event,) = ledger.events
+    for _ in range(2):  # the second finds the first one's work, and has nothing new to say
+        wanted = refined(training, painted, ledger=ledger, config=replace(config, lpips=0.1))
+        assert equal_bits(parameters_of(without), parameters_of(wanted))
+    (event,) = (event for event in ledger.events if event["kind"] != "resumed")
     assert event["kind"] == "left_out"
     assert event["data"]["what"] == "lpips term"
     assert "vgg16-397923af.pth" in event["data"]["reason"]
