@@ -73,7 +73,7 @@ def test_clothes_beyond_the_body_model_are_found(finder, colour):
 def test_a_person_thinner_than_the_body_model_is_found(finder):
     view = a_view()
     truth = cv2.erode(view.body.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    image = np.where(truth[..., None], np.uint8([60, 90, 140]), np.uint8(255))
+    image = np.where(truth[..., None], np.array([60, 90, 140], np.uint8), np.uint8(255))
     view = replace(view, person=truth & ~view.unknown)
     hidden = view.unknown
     assert silhouette_iou(finder.complete(view, image)[hidden], truth[hidden]) > 0.95

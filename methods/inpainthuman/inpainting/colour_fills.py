@@ -1,4 +1,4 @@
-"""Inpainting that knows nothing of people: one colour, or OpenCV's two classic methods. The floor of every figure."""
+"""Inpainting that knows nothing of people: one colour, the nearest ones, OpenCV's classics. Every figure's floor."""
 
 from __future__ import annotations
 
