@@ -34,13 +34,21 @@ def usage() -> str:
         "",
     ]
     lines += [f"  {name:<11}{what}" for name, what in COMMANDS.items()]
-    lines += [f"  {name:<11}{registry.load('command', name).SUMMARY}" for name in registry.names("command")]
+    lines += [f"  {name:<11}{_summary(name)}" for name in registry.names("command")]
     lines += [
         "",
         "start here: ihbench run --protocol zju_occ --scene standin-1",
         "exit status: 0 done, 1 a check failed or a run diverged, 2 bad input or a missing prerequisite",
     ]
     return "\n".join(lines)
+
+
+def _summary(name: str) -> str:
+    """What a registered command says of itself. One that cannot be loaded must not take the help away."""
+    try:
+        return registry.load("command", name).SUMMARY
+    except BadInput as error:
+        return str(error)
 
 
 def _bound_spinning() -> None:

@@ -28,21 +28,26 @@ class InpaintHuman:
         """Fit one person. See `ihbench.scene.Method`. Raises `BadInput` without a view that shows the person."""
         if not len(training.views):
             raise BadInput(f"scene {training.name}: no training view; nothing to fit")
+        inpaint = self.config.inpaint
         with ledger.stage("fit/prepare"):
+            if inpaint.uses_diffusion and inpaint.weights:
+                from ihbench.methods.inpainthuman.inpainting.diffusion_inpainter import check_backbone
+
+                check_backbone(inpaint)
             betas = np.mean([view.body_pose.betas for view in training.views], axis=0)
             avatar = GaussianAvatar(self.config, training.body, betas, seed).to(device)
         with ledger.stage("fit/stage1"):
             Stage1(avatar, training, seed, ledger).run(progress)
-        if self.config.inpaint.on:
+        if inpaint.on:
             # imported here: a run without inpainting must not pay for it
             from ihbench.methods.inpainthuman.stage2 import Stage2
             from ihbench.methods.inpainthuman.stage3 import Stage3
 
             with ledger.stage("fit/stage2"):
-                painted = Stage2(avatar, training, self.config.inpaint, seed, ledger).run(progress)
+                painted = Stage2(avatar, training, inpaint, seed, ledger).run(progress)
             if painted:
                 with ledger.stage("fit/stage3"):
-                    Stage3(avatar, training, painted, seed, ledger, self.config.refine).run(progress)
+                    Stage3(avatar, training, painted, seed, ledger).run(progress)
         return avatar
 
     def load(self, folder: Path, body: Body, device: str = "cpu") -> GaussianAvatar:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 
 import numpy as np
 import torch
@@ -15,7 +16,7 @@ from ihbench.progress import Progress
 from ihbench.scene import MaskState, TrainingSet
 
 
-class Optimisation:
+class Optimisation(ABC):
     """One view a step. A stage gives its loss (`_loss`), and may act before each step (`_before_step`) and after a
     saved state has been restored (`_restored`).
 
@@ -53,14 +54,14 @@ class Optimisation:
         self.names = {id(p): name for name, p in avatar.named_parameters()}
         self.step = 0
 
+    @abstractmethod
     def _loss(self, k: int) -> Tensor:
         """The loss of view k. Must be differentiable in the avatar's parameters."""
-        raise NotImplementedError
 
-    def _before_step(self) -> None:
+    def _before_step(self) -> None:  # noqa: B027
         """Called before each step; `self.step` are done."""
 
-    def _restored(self) -> None:
+    def _restored(self) -> None:  # noqa: B027
         """Called when a saved state has been restored; `self.step` are done."""
 
     def run(self, progress: Progress) -> None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ihbench.ledger import Ledger
 from ihbench.methods.inpainthuman.avatar import GaussianAvatar
-from ihbench.methods.inpainthuman.inpainting.crop_view import CropView, Inpainter, cut_view
+from ihbench.methods.inpainthuman.inpainting.crop_view import CropView, Inpainter, cut_view, with_frames
 from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
 from ihbench.methods.inpainthuman.inpainting.painted_view import PaintedView, paste_back
 from ihbench.methods.inpainthuman.inpainting.shown_view import turntable_view, with_known_surface
@@ -20,7 +20,7 @@ from ihbench.scene import MaskState, TrainingSet, TrainView
 STATE = "stage2-painted"
 TEXELS = 128  # side of the UV grid on which the need is measured
 SIMPLE_SIZE = 128  # px, height of the crops of painters without a size of their own
-LEAST_PIXELS = 12  # of a crop; fewer are not worth a painter
+LEAST_PIXELS = 12  # of a view; fewer are not worth a painter
 
 
 class Stage2:
@@ -40,35 +40,41 @@ class Stage2:
             surface = seen_surface(self.training, TEXELS)
             shown = self._shown(surface)
         if not shown:
-            reason = "every pixel's surface is shown by some training view; nothing to paint"
-            self.ledger.event("left_out", what="inpainting", reason=reason)
-            self._save([])
-            return []
+            return self._nothing()
         painter, size, square = self._painter()
+        finder = self._silhouettes()  # before anything is learned: its weights may be missing
+        body, views = self.training.body, self.training.views
         with self.ledger.stage("look"):
-            crops = {k: cut_view(view, k, self.training.body, size, square) for k, view in shown.items()}
-            crops = {k: crop for k, crop in crops.items() if crop.unknown.sum() >= LEAST_PIXELS}
+            crops = [cut_view(view, k, body, size, square) for k, view in shown.items()]
+            crops = [crop for crop in crops if crop.unknown.any()]
+            if not crops:  # what is asked lies outside of every crop
+                return self._nothing()
+            frames = [cut_view(views[k], k, body, size, square) for k in range(len(views))]
+            filmed = with_frames(crops, frames)
         if self.config.filler == "diffusion":
-            views = self.training.views
-            with self.ledger.stage("look"):
-                frames = [cut_view(views[k], k, self.training.body, size, square) for k in range(len(views))]
             painter.learn(frames, progress)
             for state, curve in painter.curves.items():
                 self.ledger.event("loss_curve", stage=state, steps=curve.steps[::5], losses=curve.losses[::5])
         with self.ledger.stage("inpaint"):
-            ordered = list(crops.values())
-            painted = painter.inpaint(ordered, progress)
+            # the simple painters take their colours from whatever frame shows them
+            given = crops if self.config.filler == "diffusion" else filmed
+            painted = painter.inpaint(given, progress)[: len(crops)]
         with self.ledger.stage("silhouette"):
-            finder = self._silhouettes()
-            silhouettes = [finder.complete(view, image) for view, image in zip(ordered, painted, strict=True)]
+            silhouettes = [finder.complete(view, image) for view, image in zip(crops, painted, strict=True)]
         out = [
             paste_back(shown[view.index], view, image, silhouette, self._original(view.index))
-            for view, image, silhouette in zip(ordered, painted, silhouettes, strict=True)
+            for view, image, silhouette in zip(crops, painted, silhouettes, strict=True)
         ]
         with self.ledger.stage("measure"):
-            self._record(ordered, painted, silhouettes)
+            self._record(crops, filmed, painted, silhouettes)
         self._save(out)
         return out
+
+    def _nothing(self) -> list[PaintedView]:
+        reason = "every pixel's surface is shown by some training view; nothing to paint"
+        self.ledger.event("left_out", what="inpainting", reason=reason)
+        self._save([])
+        return []
 
     def _shown(self, surface: SeenSurface) -> dict[int, TrainView]:
         """Number -> view, as the painter is shown it; numbers beyond the training views are of turntable views."""
@@ -85,7 +91,7 @@ class Stage2:
             angle = 2 * np.pi * turn / config.turntable
             like = views[clearest]
             shown[len(views) + turn] = turntable_view(angle, like, training, self.avatar, surface)
-        return {k: view for k, view in shown.items() if (view.mask == MaskState.UNKNOWN).any()}
+        return {k: view for k, view in shown.items() if (view.mask == MaskState.UNKNOWN).sum() >= LEAST_PIXELS}
 
     def _painter(self) -> tuple[Any, int, bool]:
         """The painter, the height of its crops in px, and whether they must be square."""
@@ -111,19 +117,26 @@ class Stage2:
         return self.training.views[index] if index < len(self.training.views) else None
 
     def _record(
-        self, views: list[CropView], painted: list[NDArray[np.uint8]], silhouettes: list[NDArray[np.bool_]]
+        self,
+        views: list[CropView],
+        filmed: list[CropView],
+        painted: list[NDArray[np.uint8]],
+        silhouettes: list[NDArray[np.bool_]],
     ) -> None:
-        """What the paper claims of its paintings, measured, and a picture of them."""
+        """What the paper claims of its paintings, measured against what was filmed, and a picture of them."""
         from ihbench.methods.inpainthuman.inpainting.drift import flicker, identity_drift
 
-        body = self.training.body
+        body, frames = self.training.body, len(self.training.views)
+        images = painted + [view.image for view in filmed[len(painted) :]]
+        # a turntable view follows no other in time
+        in_time = [k for k, view in enumerate(views) if view.index < frames]
         self.ledger.event(
             "inpainted",
             views=len(views),
-            of=len(self.training.views),
+            of=frames,
             pixels=int(sum(view.unknown.sum() for view in views)),
-            identity_drift=identity_drift(views, painted, body),
-            flicker=flicker(views, painted, body),
+            identity_drift=identity_drift(filmed, images, body),
+            flicker=flicker([filmed[k] for k in in_time], [painted[k] for k in in_time], body),
         )
         if self.ledger.folder is not None:
             from ihbench.atomic import write_bytes

@@ -10,7 +10,7 @@ import pytest
 from ihbench.body.uv import texel_table
 from ihbench.ledger import Ledger
 from ihbench.methods.inpainthuman import stage2
-from ihbench.methods.inpainthuman.inpainting.crop_view import cut_view
+from ihbench.methods.inpainthuman.inpainting.crop_view import cut_view, with_frames
 from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
 from ihbench.methods.inpainthuman.inpainting.painted_view import paste_back
 from ihbench.methods.inpainthuman.inpainting.shown_view import orbit, turntable_view, with_known_surface
@@ -176,6 +176,38 @@ class TestStage2:
         for view in painted:
             hidden = training.views[view.index].mask == MaskState.UNKNOWN
             assert (view.generated & hidden).sum() > 0.5 * hidden.sum()
+
+    def test_simple_painters_borrow_from_frames_that_need_no_painting(self):
+        """Only the first view hides something; the clear one after it shows what."""
+        clear = train_view(a_camera(0.0, SIZE), a_pose(0.0, 0.0), None, frame=1)
+        training = training_set([train_view(a_camera(0.0, SIZE), a_pose(0.0, 0.0), HIDDEN, frame=0), clear])
+        config = replace(SIMPLE, context="frame", filler="temporal")
+        (done,) = Stage2(an_avatar(), training, config, 0, Ledger()).run(QUIET)
+        believed = done.generated & (done.view.mask == MaskState.PERSON)
+        assert believed.sum() > 50
+        error = np.abs(done.view.image[believed].astype(int) - clear.image[believed]).mean()
+        (mean,) = Stage2(an_avatar(), training, replace(config, filler="mean"), 0, Ledger()).run(QUIET)
+        assert error < 0.5 * np.abs(mean.view.image[believed].astype(int) - clear.image[believed]).mean()
+
+    def test_what_the_avatar_drew_is_no_evidence(self):
+        training = training_set()
+        crops = [cut_view(view, k, the_body(), 64) for k, view in enumerate(training.views)]
+        asked = [replace(crops[1], person=crops[1].body), replace(crops[0], index=6)]  # drawn, and a turntable view
+        filmed = with_frames(asked, crops)
+        assert [view.index for view in filmed] == [1, 6, 0, 2, 3, 4, 5]
+        assert (filmed[0].person == crops[1].person).all()
+        assert not filmed[1].person.any()
+        assert (filmed[0].unknown == asked[0].unknown).all()
+        assert not any(view.unknown.any() for view in filmed[2:])
+
+    def test_nothing_to_paint_inside_any_crop(self, monkeypatch):
+        """Hidden pixels far from the person ask for nothing."""
+        far = slice(0, 3)
+        ledger = Ledger()
+        config = replace(SIMPLE, context="frame")
+        monkeypatch.setattr(Stage2, "_shown", lambda self, surface: {0: one_sided(far).views[0]})
+        assert Stage2(an_avatar(), one_sided(far), config, 0, ledger).run(QUIET) == []
+        assert [event["kind"] for event in ledger.events] == ["left_out"]
 
     def test_what_is_claimed_is_in_the_record(self):
         ledger = Ledger()

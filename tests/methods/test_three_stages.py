@@ -7,12 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ihbench.errors import BadInput
 from ihbench.ledger import Ledger
 from ihbench.methods.inpainthuman.config import QUICK, InpaintHumanConfig, config_from, outside_files
 from ihbench.methods.inpainthuman.inpainting.mini_weights import save_mini
 from ihbench.methods.inpainthuman.inpainting.personalise import ADAPT_STATE, TI_STATE
 from ihbench.methods.inpainthuman.method import InpaintHuman
+from ihbench.methods.inpainthuman.stage1 import Stage1
 from ihbench.progress import Progress
+from ihbench.protocol import load_protocol
+from ihbench.run_loop import RunRequest, _outside
 from tests.bench.fake_capture import a_camera, a_pose, train_view
 from tests.methods.sd2_miniature import make_miniature
 from tests.methods.tiny_diffusion import tiny_backbone
@@ -142,6 +146,28 @@ def test_an_avatar_remembers_its_whole_configuration(tmp_path, mini):
     avatar = fit(replace(given, refine=replace(given.refine, steps=1)))
     avatar.save(tmp_path)
     assert InpaintHuman(QUICK).load(tmp_path, avatar.body).config == avatar.config
+
+
+def test_wrong_weights_are_named_before_anything_is_fitted(tmp_path, monkeypatch):
+    monkeypatch.setattr(Stage1, "run", None)
+    with pytest.raises(BadInput, match="lacks unet, controlnet"):
+        fit(config(tmp_path))
+    with pytest.raises(BadInput, match="lacks unet/, vae/"):
+        fit(config(tmp_path, backbone="sd2"))
+    with pytest.raises(BadInput, match="sam-weights ''"):
+        config(tmp_path, silhouette="sam")
+    with pytest.raises(BadInput, match="weights ''"):
+        config("", backbone="sd2")
+
+
+def test_other_content_at_the_same_path_is_another_run(tmp_path):
+    save_mini(tiny_backbone(), tmp_path)
+    request = RunRequest(load_protocol("zju_occ"), "inpainthuman", config(tmp_path))
+    first = _outside(request)
+    assert first == _outside(request)
+    save_mini(tiny_backbone(seed=3), tmp_path)
+    assert first["outside"] != _outside(request)["outside"]
+    assert _outside(replace(request, config=QUICK)) == {}
 
 
 def test_weights_outside_the_package_are_part_of_a_runs_identity(mini):

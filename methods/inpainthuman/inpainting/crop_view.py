@@ -60,6 +60,21 @@ def cut_view(view: TrainView, index: int, body: Body, size: int, square: bool = 
     return CropView(index, image, person & ~unknown, unknown, parts, crop, camera, view.body_pose)
 
 
+def with_frames(asked: list[CropView], frames: list[CropView]) -> list[CropView]:
+    """The views to paint, then all other frames with nothing to paint: everything that was filmed, and nothing else.
+
+    `frames[k]` is training view k. In `asked` only pixels that the camera showed stay known as person: what was drawn
+    into a view by the avatar is no evidence, and of a turntable view (an index beyond the frames) nothing is.
+    """
+    nobody = [np.zeros_like(view.person) for view in asked]
+    person = [
+        frames[v.index].person if v.index < len(frames) else none for v, none in zip(asked, nobody, strict=True)
+    ]
+    wanted = {view.index for view in asked}
+    others = [replace(f, unknown=np.zeros_like(f.unknown)) for f in frames if f.index not in wanted]
+    return [replace(view, person=filmed) for view, filmed in zip(asked, person, strict=True)] + others
+
+
 class Inpainter(Protocol):
     """Fills the unknown pixels of crops. Deterministic by its own seed."""
 
@@ -68,8 +83,3 @@ class Inpainter(Protocol):
     def inpaint(self, views: list[CropView], progress: Progress) -> list[NDArray[np.uint8]]:
         """One completed crop [S, W, 3] per view, equal to the view's image where it is known."""
         ...
-
-
-def as_shown(view: CropView, image: NDArray[np.uint8]) -> CropView:
-    """The same view with another image, for composites."""
-    return replace(view, image=image)

@@ -29,6 +29,18 @@ def load_backbone(config: InpaintConfig, device: str) -> Backbone:
     return load_mini(Path(config.weights) if config.weights else None, device)
 
 
+def check_backbone(config: InpaintConfig) -> None:
+    """What `load_backbone` would complain of and a look at the folder can tell, before an hour of fitting."""
+    if config.backbone == "sd2":
+        from ihbench.methods.inpainthuman.inpainting.sd2_weights import check_sd2
+
+        check_sd2(config.weights)
+    elif config.weights:
+        from ihbench.methods.inpainthuman.inpainting.mini_weights import check_mini
+
+        check_mini(Path(config.weights))
+
+
 class DiffusionInpainter:
     """A backbone, personalised by `learn` from the training views or left generic."""
 

@@ -110,6 +110,7 @@ class InpaintConfig:
                 '0 unless --method.inpaint.context is "seen"',
             ),
             ("token", bool(self.token.strip()) and " " not in self.token, "one word"),
+            ("sam_weights", self.silhouette != "sam" or bool(self.sam_weights), SAM_WANTED),
             ("weights", self.backbone != "sd2" or not self.uses_diffusion or bool(self.weights), SD2_WANTED),
         )
         for name, holds, expected in rules:
@@ -131,6 +132,7 @@ class InpaintConfig:
         return self.on and self.filler == "diffusion"
 
 
+SAM_WANTED = "the folder of HQ-SAM in transformers' layout, which silhouette sam needs"
 SD2_WANTED = (
     "the folder of Stable Diffusion 2 inpainting (diffusers layout: unet/ vae/ text_encoder/ tokenizer/ scheduler/, "
     "safetensors), which backbone sd2 needs"

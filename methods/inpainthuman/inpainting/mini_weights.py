@@ -21,6 +21,7 @@ def save_mini(backbone: Backbone, folder: Path) -> None:
     for name in ("unet", "controlnet", "text_encoder", "codec"):
         part = getattr(backbone, name)
         kind = torch.float32 if name == "codec" else torch.float16
+        # rounded and put back: a copy would take along whatever hooks a training has on the module
         original = {key: value.detach().clone() for key, value in part.state_dict().items()}
         part.to(kind).save_pretrained(folder / name, safe_serialization=True)
         part.to(torch.float32)
@@ -29,14 +30,20 @@ def save_mini(backbone: Backbone, folder: Path) -> None:
     backbone.scheduler.save_pretrained(folder / "scheduler")
 
 
-def load_mini(folder: Path | None = None, device: str = "cpu") -> Backbone:
-    """The shipped backbone, or one that `ihbench train-mini` wrote. Raises `BadInput` for another folder."""
-    folder = SHIPPED if folder is None else Path(folder).expanduser()
+def check_mini(folder: Path) -> Path:
+    """The folder, if it has every part."""
+    folder = Path(folder).expanduser()
     missing = [name for name in PARTS if not (folder / name).is_dir()]
     if missing:
         raise BadInput(
             f"{folder}: not a mini backbone, lacks {', '.join(missing)}; `ihbench train-mini --out DIR` makes one"
         )
+    return folder
+
+
+def load_mini(folder: Path | None = None, device: str = "cpu") -> Backbone:
+    """The shipped backbone, or one that `ihbench train-mini` wrote. Raises `BadInput` for another folder."""
+    folder = check_mini(SHIPPED if folder is None else folder)
     from diffusers import ControlNetModel, DDIMScheduler, UNet2DConditionModel
     from transformers import AutoTokenizer, CLIPTextModel
 

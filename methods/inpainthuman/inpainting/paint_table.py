@@ -22,7 +22,7 @@ from ihbench.protocol import Protocol
 from ihbench.scene import Capture
 from ihbench.views import open_scene
 
-SIZE = 128  # px, height of the crops of every painter, so that they paint the same pixels
+SIZES = {"mini": (128, False), "sd2": (512, True)}  # px, height of all painters' crops, and whether they are square
 SCORES = ("psnr", "ssim", "flip")
 
 
@@ -39,13 +39,14 @@ def paint_scene(
     """Row -> scores over the scene's hidden pixels, and a picture. Raises `BadInput` when nothing is hidden."""
     from ihbench.methods.inpainthuman.inpainting.drift import flicker, hidden_scores, identity_drift
 
+    size, square = SIZES[config.backbone]
     occluded = open_scene(capture, protocol).train
     whole = open_scene(capture, protocol.with_occlusion("none")).train
     with progress.task(f"cutting {capture.name}", 2 * len(occluded)) as task:
         views, truths = [], []
         for k in range(len(occluded)):
-            views.append(cut_view(occluded[k], k, body, SIZE))
-            truths.append(cut_view(whole[k], k, body, SIZE))
+            views.append(cut_view(occluded[k], k, body, size, square))
+            truths.append(cut_view(whole[k], k, body, size, square))
             task.advance(2)
     hiding = [k for k, view in enumerate(views) if view.unknown.any()]
     if not hiding:
@@ -105,7 +106,8 @@ def _paint(
 
 def _row(images: Sequence[NDArray[np.uint8]], most: int = 10) -> NDArray[np.uint8]:
     shown = [images[k] for k in np.unique(np.linspace(0, len(images) - 1, min(most, len(images))).astype(int))]
-    cells = [np.pad(image, ((2, 2), (0, SIZE - image.shape[1]), (0, 0)), constant_values=200) for image in shown]
+    wide = [(0, image.shape[0] - image.shape[1]) for image in shown]
+    cells = [np.pad(image, ((2, 2), w, (0, 0)), constant_values=200) for image, w in zip(shown, wide, strict=True)]
     return np.concatenate(cells, 1)
 
 

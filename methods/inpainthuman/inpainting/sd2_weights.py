@@ -89,10 +89,7 @@ def load_sd2(
     """
     device = torch.device(device)
     number = _number_type(dtype, device)
-    folder = find_folder(weights, OPTION)
-    _check_layout(folder)
-    configs = {part: read_json(folder / part / "config.json") for part in STEMS}
-    _check_model(folder, configs)
+    folder, configs = check_sd2(weights)
     scheduler, tokenizer = _scheduler(folder), _tokenizer(folder, configs["text_encoder"])
     unet, vae, text_encoder = _unread(folder, configs)
     controlnet, base_unet = _unread_control(control, base, unet.module.config, vae.module.config)
@@ -122,6 +119,15 @@ def load_sd2(
     codec = LatentAutoencoder(vae)
     size = int(unet.config["sample_size"] or 64) * codec.block
     return Backbone("sd2", unet, text_encoder, tokenizer, controlnet, codec, scheduler, size, square=True)
+
+
+def check_sd2(weights: str) -> tuple[Path, dict[str, dict[str, Any]]]:
+    """The folder and its parts' configurations, after everything was checked that needs no weight to be read."""
+    folder = find_folder(weights, OPTION)
+    _check_layout(folder)
+    configs = {part: read_json(folder / part / "config.json") for part in STEMS}
+    _check_model(folder, configs)
+    return folder, configs
 
 
 def _number_type(dtype: str, device: torch.device) -> torch.dtype:
