@@ -21,7 +21,8 @@ class Optimisation(ABC):
     saved state has been restored (`_restored`).
 
     `steps` are the stage's own. `first_step` is how many the avatar had before, so that steps offered to the ledger
-    and named in a divergence grow over all stages. `lr_share` scales the configured step sizes.
+    and named in a divergence grow over all stages. `lr_share` scales the configured step sizes, which rise over the
+    share `warm_up` of the steps.
     """
 
     name: str  # of the saved state
@@ -38,9 +39,10 @@ class Optimisation(ABC):
         views: int,
         first_step: int = 0,
         lr_share: float = 1.0,
+        warm_up: float = 0.0,
     ):
         self.avatar, self.training, self.seed, self.ledger = avatar, training, seed, ledger
-        self.steps, self.views, self.first_step = steps, views, first_step
+        self.steps, self.views, self.first_step, self.warm_up = steps, views, first_step, warm_up
         config = avatar.config
         groups = [
             {"params": list(avatar.features.parameters()), "lr": config.lr_maps * lr_share, "weight_decay": 0.0},
@@ -99,9 +101,10 @@ class Optimisation(ABC):
         config = self.avatar.config
         self._before_step()
         share = self.step / self.steps
+        rise = min((self.step + 1) / max(self.warm_up * self.steps, 1), 1)
         decay = config.lr_final + (1 - config.lr_final) * 0.5 * (1 + math.cos(math.pi * share))
         for group, rate in zip(self.optimizer.param_groups, self.rates, strict=True):
-            group["lr"] = rate * decay
+            group["lr"] = rate * decay * rise
         self.optimizer.zero_grad(set_to_none=True)
         loss = self._loss(k)
         if not math.isfinite(loss.item()):
@@ -130,7 +133,7 @@ class Optimisation(ABC):
             for name, p in self.avatar.named_parameters():
                 p.copy_(torch.as_tensor(tensors[f"avatar.{name}"]))
                 state = {
-                    key: torch.as_tensor(tensors[f"adam.{name}.{key}"]).clone()
+                    key: torch.as_tensor(tensors[f"adam.{name}.{key}"]).to(p.device, copy=True)
                     for key in ("step", "exp_avg", "exp_avg_sq")
                     if f"adam.{name}.{key}" in tensors
                 }

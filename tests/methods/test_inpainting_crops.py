@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -10,7 +12,14 @@ from ihbench.body import load_body
 from ihbench.camera import Camera, look_at
 from ihbench.methods.inpainthuman.inpainting.block_transform import BlockTransform
 from ihbench.methods.inpainthuman.inpainting.crop_view import cut_view
-from ihbench.methods.inpainthuman.inpainting.part_map import NO_PART, palette, part_colours, part_labels
+from ihbench.methods.inpainthuman.inpainting.part_map import (
+    BACK,
+    NO_PART,
+    palette,
+    part_colours,
+    part_labels,
+    smpl_parts,
+)
 from ihbench.methods.inpainthuman.inpainting.person_crop import PersonCrop, person_crop
 from ihbench.methods.inpainthuman.inpainting.push_pull import push_pull
 from ihbench.methods.inpainthuman.inpainting.random_mask import KINDS, random_mask
@@ -82,14 +91,25 @@ class TestPersonCrop:
 
 class TestPartMap:
     def test_left_and_right_lie_on_their_sides(self, body):
-        labels = part_labels(body.pose(STANDING), body, camera())
+        labels = smpl_parts(part_labels(body.pose(STANDING), body, camera()))
         columns = np.arange(200)[None].repeat(200, 0)
         left_hip, right_hip = columns[labels == 1].mean(), columns[labels == 2].mean()
         assert left_hip > right_hip  # the person faces the camera: their left is on our right
         assert set(np.unique(labels)) <= {*range(24), NO_PART}
 
-    def test_every_part_has_a_colour_of_its_own(self):
-        assert len(np.unique(palette(), axis=0)) == 24
+    def test_a_head_from_the_front_is_not_one_from_behind(self, body):
+        def share_of_backs(turn: float) -> float:
+            pose = STANDING.pose.copy()
+            pose[0] = [0, turn, 0]
+            labels = part_labels(body.pose(replace(STANDING, pose=pose)), body, camera())
+            head = labels[smpl_parts(labels) == 15]
+            return float((head >= BACK).mean())
+
+        assert share_of_backs(0.0) < 0.1
+        assert share_of_backs(np.pi) > 0.9
+
+    def test_every_side_of_a_part_has_a_colour_of_its_own(self):
+        assert len(np.unique(palette(), axis=0)) == 48
         shown = part_colours(np.array([[3, NO_PART]], np.uint8))
         assert (shown[0, 0] == palette()[3]).all()
         assert not shown[0, 1].any()

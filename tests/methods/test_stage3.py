@@ -314,12 +314,12 @@ def test_cleared_background_pulls_in_what_spills_behind_the_occluder():
 
 
 def test_views_that_were_never_taken_are_learned_from(views):
-    """Their pixels count in the refinement alone; they come once an epoch like the others."""
+    """Their pixels count in the refinement alone; they take turns with the others."""
     back = train_view(a_camera(np.pi, SIZE), a_pose(0.2, 0.1), frame=-1)
     extra = PaintedView(6, back, np.ones(back.mask.shape, bool))
     avatar = shaken(an_avatar(feature_weight=0.0, offset_weight=0.0, scale_weight=0.0), 0.05)
     stage = Stage3(avatar, training_set(views), [extra], 0, Ledger(), REFINE)
-    assert sorted(stage._view_of(step, stage.views) for step in range(7)) == list(range(7))
+    assert {stage._view_of(step, stage.views) for step in range(12)} == set(range(7))
     target = stage._targets[6]
     assert not target.original.person.any()
     assert not target.original.background.any()
@@ -368,16 +368,29 @@ def test_the_configuration_is_the_avatars_own(views, painted):
     assert Stage3(avatar, training_set(views), painted, 0, Ledger()).steps == 3
 
 
-def test_step_sizes_are_a_share_of_stage_ones_and_fall_along_a_cosine(views):
+def test_step_sizes_are_a_share_of_stage_ones_rise_and_fall_along_a_cosine(views):
     avatar = an_avatar(steps=7, lr_final=0.1)
-    stage = Stage3(avatar, training_set(views[:1]), [], 0, Ledger(), replace(REFINE, steps=4, lr_share=0.3))
+    chosen = replace(REFINE, steps=4, lr_share=0.3, warm_up=0.5)
+    stage = Stage3(avatar, training_set(views[:1]), [], 0, Ledger(), chosen)
     rates = []
     step = stage.optimizer.step
     stage.optimizer.step = lambda: rates.append([group["lr"] for group in stage.optimizer.param_groups]) or step()
     stage.run(Progress.silent())
     config = avatar.config
-    expected = 0.3 * (0.1 + 0.9 * 0.5 * (1 + np.cos(np.pi * np.arange(4) / 4)))
+    expected = 0.3 * (0.1 + 0.9 * 0.5 * (1 + np.cos(np.pi * np.arange(4) / 4))) * [0.5, 1, 1, 1]
     np.testing.assert_allclose(rates, expected[:, None] * [config.lr_maps, config.lr_decoder, config.lr_encoder])
+
+
+@pytest.mark.parametrize(("share", "expected"), [(0.0, 10), (0.5, 10), (0.75, 15), (1.0, 20)])
+def test_painted_views_take_their_share_of_the_steps_and_every_view_its_turn(views, painted, share, expected):
+    """Three of six views are painted, so without a share of their own they take half of the steps."""
+    stage = Stage3(an_avatar(), training_set(views), painted, 0, Ledger(), replace(REFINE, painted_share=share))
+    order = [stage._view_of(step, 6) for step in range(20)]
+    assert len(views) == 6
+    assert sum(k in (1, 3, 5) for k in order) == expected
+    assert set(order) == (set(range(6)) if share < 1 else {1, 3, 5})
+    assert max(order.count(k) for k in (1, 3, 5)) - min(order.count(k) for k in (1, 3, 5)) <= 1
+    assert order == [stage._view_of(step, 6) for step in range(20)]
 
 
 # ---------------------------------------------------------------------------------------------------- LPIPS
@@ -597,6 +610,7 @@ def test_no_visible_pixel_is_said(views, painted):
     [
         {"steps": -1}, {"weight": -1.0}, {"ssim": -0.1}, {"lpips": float("nan")}, {"lpips_net": "vgg19"},
         {"generated": float("inf")}, {"background": -1.0}, {"lr_share": 0.0}, {"lr_share": float("nan")},
+        {"warm_up": 1.5}, {"painted_share": -0.1},
     ],
     ids=str,
 )  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,14 @@ import torch
 
 from ihbench.cli import main
 from ihbench.errors import BadInput
-from ihbench.methods.inpainthuman.inpainting import crop_album, mini_model, mini_validation, mini_weights, train_mini
+from ihbench.methods.inpainthuman.inpainting import (
+    crop_album,
+    mini_batches,
+    mini_model,
+    mini_validation,
+    mini_weights,
+    train_mini,
+)
 from ihbench.methods.inpainthuman.inpainting.crop_album import CropAlbum
 from ihbench.methods.inpainthuman.inpainting.mini_training import MiniTraining
 from ihbench.methods.inpainthuman.inpainting.mini_weights import load_mini, save_mini
@@ -20,7 +28,7 @@ from tests.methods.tiny_diffusion import same, tiny_backbone, weights
 from tests.methods.tiny_fit import one_thread
 
 QUIET = Progress.silent()
-SMALL = MiniTraining(people=2, each=2, steps=4)
+SMALL = MiniTraining(people=2, each=2, steps=4, batch=3)
 SIDE = 64  # px
 
 
@@ -30,9 +38,8 @@ def small(monkeypatch):
     monkeypatch.setattr(mini_model, "CHANNELS", (32, 32, 32))
     for module in (crop_album, train_mini, mini_validation):
         monkeypatch.setattr(module, "PAGE", 2)
-    for module in (mini_model, train_mini, mini_weights):
+    for module in (mini_model, mini_batches, train_mini, mini_weights):
         monkeypatch.setattr(module, "SIZE", SIDE)
-    monkeypatch.setattr(train_mini, "PIXELS", 2 * SIDE * SIDE)
     monkeypatch.setattr(mini_validation, "PEOPLE", 2)
     with one_thread():
         yield
@@ -53,11 +60,11 @@ def test_killed_and_resumed_ends_the_same(tmp_path, album, monkeypatch):
     part = MiniTrainer(SMALL, tmp_path / "part", album, QUIET)
     honest = part._one_step
 
-    def step():
+    def step(batch):
         if part.step == 2:
             part.save()
             raise Killed
-        return honest()
+        return honest(batch)
 
     monkeypatch.setattr(part, "_one_step", step)
     with pytest.raises(Killed):
@@ -70,19 +77,50 @@ def test_killed_and_resumed_ends_the_same(tmp_path, album, monkeypatch):
     assert [row["step"] for row in curve_of(tmp_path / "part")] == [4]
 
 
+def test_worker_processes_make_the_same_batches(tmp_path, album):
+    batches = MiniTrainer(SMALL, tmp_path, album, QUIET).batches
+    for step, made in enumerate(batches.stream(0, 3, workers=2)):
+        own = batches[step]
+        assert torch.equal(made.noise, own.noise)
+        assert torch.equal(made.hidden, own.hidden)
+        assert made.prompts == own.prompts
+
+
+def test_half_precision_arithmetic_is_close(tmp_path, album):
+    full = MiniTrainer(SMALL, tmp_path / "full", album, QUIET)
+    half = MiniTrainer(replace(SMALL, precision="bfloat16"), tmp_path / "half", album, QUIET)
+    batch = full.batches[0]
+    with torch.no_grad():
+        expected, found = full.loss(batch).item(), half.loss(batch).item()
+    assert found != expected
+    assert found == pytest.approx(expected, rel=0.02)
+
+
 def test_another_configuration_does_not_go_on(tmp_path, album):
     trainer = MiniTrainer(SMALL, tmp_path, album, QUIET)
-    trainer._one_step()
+    trainer._one_step(trainer.batches[0])
     trainer.step = 1
     trainer.save()
-    from dataclasses import replace
-
     with pytest.raises(BadInput, match="other lr"):
         MiniTrainer(replace(SMALL, lr=1e-3), tmp_path, album, QUIET)
     assert MiniTrainer(replace(SMALL, steps=9), tmp_path, album, QUIET).step == 1
     (tmp_path / train_mini.STATE).write_bytes(b"damaged")
     with pytest.raises(BadInput, match="not a readable training state"):
         MiniTrainer(SMALL, tmp_path, album, QUIET)
+
+
+def test_a_training_starts_from_an_earlier_backbone(tmp_path, album):
+    earlier = MiniTrainer(SMALL, tmp_path / "earlier", album, QUIET)
+    save_mini(earlier.backbone, tmp_path / "folder")
+    later = MiniTrainer(replace(SMALL, seed=5), tmp_path / "later", album, QUIET, start=tmp_path / "folder")
+    for name in (*train_mini.TRAINED, "codec"):
+        for key, value in weights(getattr(earlier.backbone, name)).items():
+            found = weights(getattr(later.backbone, name))[key]
+            torch.testing.assert_close(found, value, atol=1e-3, rtol=1e-3)  # saved in 16 bit
+    torch.testing.assert_close(later.channel_weight, earlier.channel_weight)
+    save_mini(tiny_backbone(), tmp_path / "other")
+    with pytest.raises(BadInput, match="--start: a backbone that knows other words"):
+        MiniTrainer(SMALL, tmp_path / "never", album, QUIET, start=tmp_path / "other")
 
 
 def test_people_come_in_pages(tmp_path, album):
@@ -93,11 +131,12 @@ def test_people_come_in_pages(tmp_path, album):
 def test_the_loss_sees_the_prompted_traits(tmp_path, album):
     """Trait tokens reach the text encoder's output of told prompts alone."""
     trainer = MiniTrainer(MiniTraining(people=2, each=2, traits=1.0, captions=0.0), tmp_path, album, QUIET)
-    rng = np.random.default_rng(0)
-    both = trainer._text(rng, np.array([0, 1]))
+    words = replace(trainer.batches[0], traits=torch.from_numpy(trainer.batches.crops.traits))
+    prompts, told = trainer.batches.words(np.random.default_rng(0), np.array([0, 1]))
+    assert told == [True, True]
+    both = trainer._text(replace(words, prompts=prompts, told=torch.tensor(told)))
     assert not torch.equal(both[0], both[1])
-    silent = MiniTrainer(MiniTraining(people=2, each=2, traits=0.0, captions=0.0), tmp_path / "b", album, QUIET)
-    both = silent._text(rng, np.array([0, 1]))
+    both = trainer._text(replace(words, prompts=prompts, told=torch.tensor([False, False])))
     assert torch.equal(both[0], both[1])
 
 

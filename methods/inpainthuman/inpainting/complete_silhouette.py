@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from ihbench.errors import BadInput
 from ihbench.methods.inpainthuman.inpainting.checkpoint import has_pickles, read_json, weight_files
 from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
+from ihbench.methods.inpainthuman.inpainting.part_map import smpl_parts
 
 RIM = 0.03  # of the body's height in the crop: how far inside and outside of the posed body the painted image decides
 DEEP = 0.02  # of the body's height: so far inside the person the colour is no mixture
@@ -129,7 +130,7 @@ class SamSilhouette:
             return rim.result(view.body)
         inputs = self.processor(
             images=np.ascontiguousarray(image),
-            input_points=[[[[float(x), float(y)] for x, y in _points_on_parts(view.parts)]]],
+            input_points=[[[[float(x), float(y)] for x, y in _points_on_parts(smpl_parts(view.parts))]]],
             input_boxes=[[[float(edge) for edge in _box(rim.outside <= rim.pixels(RIM))]]],
             return_tensors="pt",
         )

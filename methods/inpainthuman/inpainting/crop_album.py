@@ -20,6 +20,7 @@ from ihbench.methods.inpainthuman.inpainting.part_map import part_labels
 from ihbench.methods.inpainthuman.inpainting.person_crop import PADDING, person_crop
 from ihbench.progress import Progress
 
+VERSION = 2  # of what is kept of a photograph
 PAGE = 100  # people per file
 JITTER = 0.03  # of the body's longer side, by which the padding varies
 
@@ -67,7 +68,8 @@ class CropAlbum:
 
     def __init__(self, folder: Path, people: str, each: int, size: int):
         self.people, self.each, self.size = people, each, size
-        self.folder = Path(folder) / f"{people}-v{registry.load('people', people).VERSION}-{each}x{size}"
+        version = f"{registry.load('people', people).VERSION}.{VERSION}"
+        self.folder = Path(folder) / f"{people}-v{version}-{each}x{size}"
 
     def path(self, start: int) -> Path:
         return self.folder / f"{start:08d}.npz"

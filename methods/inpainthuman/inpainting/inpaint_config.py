@@ -78,7 +78,7 @@ class InpaintConfig:
     context: Literal["seen", "frame"] = "seen"
     """What the inpainter is shown besides visible pixels. "seen": hidden pixels whose surface another frame shows are
     drawn by the stage-1 avatar, and only what no frame shows is painted. "frame": the frame alone, as the paper."""
-    key_views: int = 24
+    key_views: int = 40
     """Frames painted at most, chosen to see all of the surface that needs it; 0 for every frame that sees some."""
     turntable: int = 0
     """Views of the stage-1 avatar, all around it, inpainted too: the only way to surface that never faced the camera.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -15,6 +16,10 @@ class MiniTraining:
     """Photographs of every person."""
     steps: int = 3000
     """Optimisation steps; the rate falls over the last quarter."""
+    batch: int = 8
+    """Crops a step; of wider ones fewer, of narrower ones more."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Of the networks' arithmetic; bfloat16 is for GPUs."""
     lr: float = 5e-4
     """AdamW step size."""
     seed: int = 0

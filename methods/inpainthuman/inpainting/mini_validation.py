@@ -28,7 +28,7 @@ PEOPLE = 48
 
 def validate(backbone: Backbone, album: Path, each: int, progress: Progress) -> dict[str, Any]:
     """Hidden-body PSNR, pooled, on held-out people with a central strip; nothing is personalised."""
-    people = registry.load("people", "procedural")
+    people, device = registry.load("people", "procedural"), backbone.device
     store = CropAlbum(album, "procedural", each, backbone.size)
     store.make(people.HELD_OUT, PAGE, progress)
     page = next(iter(store.pages(people.HELD_OUT, PAGE)))
@@ -39,11 +39,12 @@ def validate(backbone: Backbone, album: Path, each: int, progress: Progress) -> 
             rows = first[page.widths[first] == width]
             images, person = page.images[rows, :, :width], page.silhouettes[rows, :, :width]
             hidden = np.stack([central_strip(mask) for mask in person])
+            colours = part_colours(page.parts[rows, :, :width])
             batch = DiffusionBatch(
-                pixels=torch.from_numpy(images).movedim(-1, 1).float() / 127.5 - 1,
-                unknown=torch.from_numpy(hidden)[:, None].float(),
-                person=torch.from_numpy(person & ~hidden)[:, None].float(),
-                parts=torch.from_numpy(part_colours(page.parts[rows, :, :width])).movedim(-1, 1).float() / 255,
+                pixels=torch.from_numpy(images).to(device).movedim(-1, 1).float() / 127.5 - 1,
+                unknown=torch.from_numpy(hidden).to(device)[:, None].float(),
+                person=torch.from_numpy(person & ~hidden).to(device)[:, None].float(),
+                parts=torch.from_numpy(colours).to(device).movedim(-1, 1).float() / 255,
             )
             field = shared_noise(backbone, 0, int(width))
             made = {
@@ -53,10 +54,10 @@ def validate(backbone: Backbone, album: Path, each: int, progress: Progress) -> 
             for steps, noise, parts in product(STEPS, NOISES, (False, True)):
                 name = f"mini, {steps} steps, noise {noise:g}, {'with' if parts else 'without'} parts"
                 made[name] = sample(backbone, batch, noise * field, ANYBODY, steps=steps, use_parts=parts)
-            where = torch.from_numpy(hidden & person)
+            where = torch.from_numpy(hidden & person).to(device)
             for name, painted in made.items():
                 error = ((painted - batch.pixels) / 2).square().mean(1)[where]
-                errors.setdefault(name, []).append(error.double().numpy())
+                errors.setdefault(name, []).append(error.double().cpu().numpy())
             task.advance(len(rows))
     psnr = {name: float(-10 * np.log10(np.concatenate(parts).mean())) for name, parts in errors.items()}
     return {"people": PEOPLE, "strip": STRIP, "hidden_psnr": psnr}

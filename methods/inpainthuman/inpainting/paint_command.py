@@ -30,6 +30,8 @@ class PaintOptions(ProtocolChanges):
     """Training frames painted, evenly spread; personalisation sees all."""
     seed: tuple[int, ...] = (0,)
     """Seeds; their scores are averaged per scene before anything else."""
+    device: str = "cpu"
+    """Where diffusion runs: cpu or cuda."""
     profile: str = "quick"
     """quick or paper: the size of the images."""
     data: Path | None = None
@@ -74,7 +76,15 @@ def _paint(chosen: Any) -> int:
         capture, body = source.open(scene, chosen.body, progress)
         data = capture.standin or capture.variant
         scenes[scene], picture = paint_scene(
-            capture, body, protocols[0], chosen.rows, chosen.frames, chosen.seed, chosen.inpaint, progress
+            capture,
+            body,
+            protocols[0],
+            chosen.rows,
+            chosen.frames,
+            chosen.seed,
+            chosen.inpaint,
+            progress,
+            device=chosen.device,
         )
         if chosen.out is not None:
             write_bytes(chosen.out / f"{scene}.png", png(picture))

@@ -35,6 +35,7 @@ def paint_scene(
     seeds: Sequence[int],
     config: InpaintConfig,
     progress: Progress,
+    device: str = "cpu",
 ) -> tuple[dict[str, Any], NDArray[np.uint8]]:
     """Row -> scores over the scene's hidden pixels, and a picture. Raises `BadInput` when nothing is hidden."""
     from ihbench.methods.inpainthuman.inpainting.drift import flicker, hidden_scores, identity_drift
@@ -62,7 +63,9 @@ def paint_scene(
         for seed in seeds if row in DIFFUSION else seeds[:1]:
             ledger = Ledger()
             with ledger.stage("paint"):
-                painted = _paint(row, views, chosen, body, protocol.image.background, config, seed, ledger, progress)
+                painted = _paint(
+                    row, views, chosen, body, protocol.image.background, config, seed, ledger, progress, device
+                )
             scores = hidden_scores(painted, truth_images, asked, silhouettes, protocol.image.background)
             drift, flick = identity_drift(asked, painted, body), flicker(asked, painted, body)
             scored.append(
@@ -88,6 +91,7 @@ def _paint(
     seed: int,
     ledger: Ledger,
     progress: Progress,
+    device: str,
 ) -> list[NDArray[np.uint8]]:
     if row in FILLS:
         from ihbench.methods.inpainthuman.inpainting.fillers import fillers
@@ -98,7 +102,7 @@ def _paint(
 
     ti, lora, sg = DIFFUSION[row]
     switched = replace(config, ti=ti, lora=lora, sg=sg)
-    painter = DiffusionInpainter(load_backbone(switched, "cpu"), switched, seed, ledger)
+    painter = DiffusionInpainter(load_backbone(switched, device), switched, seed, ledger)
     if ti or lora:  # a generic model learns nothing of the person, its ControlNet neither
         painter.learn(views, progress)
     return painter.inpaint([views[k] for k in chosen], progress)

@@ -1,4 +1,8 @@
-"""The semantic map that guides the ControlNet (sec. 3.3): the 24 SMPL parts of the posed body in fixed colours."""
+"""The semantic map that guides the ControlNet (sec. 3.3): the posed body's SMPL parts in fixed colours.
+
+The paper's map has a colour for each of the 24 parts. Ours has two, a bright one for the side of a part that faces
+forward in the rest pose and a dark one for its back: from a part alone a face cannot be told from the back of a head.
+"""
 
 from __future__ import annotations
 
@@ -13,15 +17,18 @@ from ihbench.camera import Camera
 from ihbench.render.zbuffer import rasterize
 
 N_PARTS = 24
+BACK = N_PARTS  # added to a part's number on its back
+N_LABELS = 2 * N_PARTS
 NO_PART = 255
+DARKER = 0.5  # a back's brightness, as a share of its front's
 
 
 @cache
 def palette() -> NDArray[np.uint8]:
-    """[24, 3] RGB; neighbours in the kinematic tree and left and right differ clearly. Background is black."""
+    """[48, 3] RGB; neighbours in the kinematic tree and left and right differ clearly. Background is black."""
     hues = [(k * 7 % N_PARTS) / N_PARTS for k in range(N_PARTS)]
     rgb = [colorsys.hsv_to_rgb(hue, (1.0, 0.55)[k % 2], (1.0, 0.75, 0.9)[k % 3]) for k, hue in enumerate(hues)]
-    return np.round(255 * np.array(rgb)).astype(np.uint8)
+    return np.round(255 * np.concatenate([rgb, DARKER * np.array(rgb)])).astype(np.uint8)
 
 
 def part_labels(
@@ -29,18 +36,26 @@ def part_labels(
     body: Body,
     camera: Camera,
 ) -> NDArray[np.uint8]:
-    """[H, W] the joint that a pixel's surface follows most (argmax of skinning weights), `NO_PART` off the body."""
+    """[H, W] the joint that a pixel's surface follows most (argmax of skinning weights), plus `BACK` where the
+    surface faces backward in the rest pose; `NO_PART` off the body."""
     raster = rasterize(camera.project(vertices), body.faces, camera.height, camera.width)
     on = raster.face >= 0
+    face = raster.face[on]
+    vertex = body.faces[face, raster.bary[on].argmax(1)]
+    a, b, c = (body.v_template[body.faces[face, k]] for k in range(3))
+    backward = np.cross(b - a, c - a)[:, 2] < 0
     labels = np.full(on.shape, NO_PART, np.uint8)
-    corner = raster.bary[on].argmax(1)
-    vertex = body.faces[raster.face[on], corner]
-    labels[on] = body.weights[vertex].argmax(1)
+    labels[on] = body.weights[vertex].argmax(1) + BACK * backward
     return labels
+
+
+def smpl_parts(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Labels without the side: 0 to 23, or `NO_PART`."""
+    return np.where(labels == NO_PART, labels, labels % N_PARTS)
 
 
 def part_colours(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """[..., H, W] labels -> [..., H, W, 3] RGB for the ControlNet."""
     table = np.zeros((256, 3), np.uint8)
-    table[:N_PARTS] = palette()
+    table[:N_LABELS] = palette()
     return table[labels]

@@ -13,7 +13,7 @@ from ihbench.body import Body
 from ihbench.body.uv import Texels, texel_table
 from ihbench.methods.inpainthuman.inpainting.colour_fills import mean_person, on_background
 from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
-from ihbench.methods.inpainthuman.inpainting.part_map import NO_PART
+from ihbench.methods.inpainthuman.inpainting.part_map import NO_PART, smpl_parts
 from ihbench.methods.inpainthuman.inpainting.surface_colours import faced_texels, off_the_rim, pixel_texels
 from ihbench.progress import Progress
 
@@ -84,7 +84,7 @@ def _inpaint(
     means = _part_means(views)
     out = []
     for view, hidden, (colour, found) in zip(views, pixels, borrowed, strict=True):
-        fill = np.where(found[:, None], colour, means[view.parts[hidden]])
+        fill = np.where(found[:, None], colour, means[smpl_parts(view.parts)[hidden]])
         out.append(view.completed(on_background(hidden, fill, background)))
     return out
 
@@ -123,7 +123,7 @@ def _part_means(views: list[CropView]) -> NDArray[np.float64]:
     """[256, 3] RGB in 0..255, the mean visible colour of each SMPL part, the person's where it is not seen."""
     total, count = np.zeros((256, 3)), np.zeros(256)
     for view in views:
-        part, rgb = view.parts[view.person], view.image[view.person]
+        part, rgb = smpl_parts(view.parts)[view.person], view.image[view.person]
         count += np.bincount(part, minlength=256)
         for channel in range(3):
             total[:, channel] += np.bincount(part, rgb[:, channel], minlength=256)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,10 @@ class TrainMiniOptions:
     """Folder of the photographs; by default in the cache."""
     train: MiniTraining = field(default_factory=MiniTraining)
     """How it is trained."""
+    start: Path | None = None
+    """Folder of a mini backbone to go on from; by default training starts from random weights."""
+    device: str = "cpu"
+    """Where to train: cpu or cuda."""
     json: bool = False
     """Print one JSON object on stdout and nothing else there."""
 
@@ -46,11 +51,15 @@ def _train(chosen: Any) -> dict[str, Any]:
     if chosen.out.resolve() == SHIPPED.resolve():
         raise BadInput(f"--out {chosen.out}: holds the shipped backbone; train in a folder of your own")
     album = chosen.album or cache_folder() / "album"
-    trainer = MiniTrainer(chosen.train, chosen.out / TRAINING, album, Progress())
+    # a GPU waits for one process that draws occluders; on the CPU more processes would only take from each other
+    workers = 0 if chosen.device == "cpu" else max((os.cpu_count() or 1) - 2, 0)
+    trainer = MiniTrainer(
+        chosen.train, chosen.out / TRAINING, album, Progress(), chosen.device, workers, start=chosen.start
+    )
     backbone = trainer.run()
     save_mini(backbone, chosen.out)
     result = validate(backbone, album, chosen.train.each, Progress())
-    write_card(chosen.out, chosen.train, trainer.seconds, result)
+    write_card(chosen.out, chosen.train, trainer.seconds, result, chosen.device, chosen.start)
     return result
 
 

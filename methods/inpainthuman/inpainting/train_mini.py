@@ -14,25 +14,22 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ihbench import atomic, registry
 from ihbench.errors import BadInput, Diverged
 from ihbench.methods.inpainthuman.inpainting.backbone import Backbone, shrink_mask
-from ihbench.methods.inpainthuman.inpainting.crop_album import PAGE, CropAlbum, Page
+from ihbench.methods.inpainthuman.inpainting.crop_album import PAGE, CropAlbum
+from ihbench.methods.inpainthuman.inpainting.mini_batches import TRAIT_TOKENS, Batches, Crops, MiniBatch
 from ihbench.methods.inpainthuman.inpainting.mini_model import SIZE, TEXT_WIDTH, new_mini
 from ihbench.methods.inpainthuman.inpainting.mini_training import MiniTraining
+from ihbench.methods.inpainthuman.inpainting.mini_weights import load_mini
 from ihbench.methods.inpainthuman.inpainting.part_map import part_colours
-from ihbench.methods.inpainthuman.inpainting.random_mask import random_mask
 from ihbench.progress import Progress
 
 STATE = "training.safetensors"
 CURVE = "curve.jsonl"
-PERSON = "a photo of a person"
-TRAIT_TOKENS = 4
 TRAINED = ("unet", "controlnet", "text_encoder")
-PIXELS = 8 * SIZE * 96  # of a batch: eight crops of the commonest width
 RISE = 200  # steps of warming up
 
 
@@ -56,58 +53,41 @@ class TraitTokens(nn.Module):
         return self.net(traits).reshape(len(traits), TRAIT_TOKENS, TEXT_WIDTH)
 
 
-class Crops:
-    """All crops of an album, by width."""
-
-    def __init__(self, pages: list[Page]):
-        starts = np.cumsum([0, *(len(page.phrases) for page in pages)])
-        self.pages = pages
-        self.phrases = [phrases for page in pages for phrases in page.phrases]
-        self.traits = np.concatenate([page.traits for page in pages])
-        self.by_width: dict[int, NDArray[np.int64]] = {}  # [n, 3] page, crop, person
-        for width in np.unique(np.concatenate([page.widths for page in pages])):
-            rows = []
-            for k, page in enumerate(pages):
-                crops = np.flatnonzero(page.widths == width)
-                rows.append(np.column_stack([np.full(len(crops), k), crops, starts[k] + page.person[crops]]))
-            self.by_width[int(width)] = np.concatenate(rows)
-        self.widths = sorted(self.by_width)
-        counts = np.array([len(self.by_width[w]) for w in self.widths], np.float64)
-        self.shares = counts / counts.sum()
-
-    def draw(self, rng: np.random.Generator) -> tuple[int, NDArray[np.int64]]:
-        """A width, and as many crops of it as fill a batch."""
-        width = self.widths[int(rng.choice(len(self.widths), p=self.shares))]
-        rows = self.by_width[width]
-        size = max(PIXELS // (SIZE * width), 1)
-        return width, rows[rng.choice(len(rows), size, replace=len(rows) < size)]
-
-    def images(self, width: int, rows: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray]:
-        """Images [B, S, W, 3], silhouettes [B, S, W] and part labels [B, S, W]."""
-        picked = [(self.pages[page], crop) for page, crop, _ in rows]
-        return (
-            np.stack([page.images[crop, :, :width] for page, crop in picked]),
-            np.stack([page.silhouettes[crop, :, :width] for page, crop in picked]),
-            np.stack([page.parts[crop, :, :width] for page, crop in picked]),
-        )
-
-
 class MiniTrainer:
     """A training in a folder: its album, its state, its loss curve."""
 
-    def __init__(self, config: MiniTraining, folder: Path, album: Path, progress: Progress):
+    def __init__(
+        self,
+        config: MiniTraining,
+        folder: Path,
+        album: Path,
+        progress: Progress,
+        device: str = "cpu",
+        workers: int = 0,
+        start: Path | None = None,
+    ):
         if config.people < PAGE or config.people % PAGE:
             raise BadInput(f"--people {config.people}: expected a multiple of {PAGE}")
         self.config, self.folder, self.progress = config, Path(folder), progress
+        self.device, self.workers = torch.device(device), workers
         people = registry.load("people", "procedural")
         store = CropAlbum(album, "procedural", config.each, SIZE)
         store.make(0, config.people, progress)
-        self.crops = Crops(list(store.pages(0, config.people)))
+        crops = Crops(list(store.pages(0, config.people)))
         self.backbone = new_mini(people.vocabulary(), config.seed)
+        if start is not None:
+            self._begin_from(load_mini(start))
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed + 1)
             self.tokens = TraitTokens(people.N_TRAITS)
+        codec, scheduler = self.backbone.codec, self.backbone.scheduler
+        self.batches = Batches(config, crops, codec.channels, codec.block, scheduler.config.num_train_timesteps)
         self.modules = {name: getattr(self.backbone, name) for name in TRAINED} | {"tokens": self.tokens}
+        for module in (*self.modules.values(), codec):
+            module.to(self.device)
+        if self.device.type == "cuda":  # convolutions are faster so there, and slower on the CPU
+            for name in ("unet", "controlnet"):
+                self.modules[name].to(memory_format=torch.channels_last)
         self.named = {
             f"{part}.{name}": p for part, module in self.modules.items() for name, p in module.named_parameters()
         }
@@ -118,13 +98,29 @@ class MiniTrainer:
         self.step, self.seconds = 0, 0.0
         self._traits: Tensor | None = None
         self.backbone.text_encoder.get_input_embeddings().register_forward_hook(self._say_traits)
-        self._standardise()
+        every_label = np.arange(256, dtype=np.uint8)
+        self.colours = torch.from_numpy(part_colours(every_label)).to(self.device).float() / 255  # [256, 3]
+        self._weigh_channels() if start is not None else self._standardise(crops)
         self._restore()
 
-    def _standardise(self) -> None:
-        page = self.crops.pages[0]
-        images = torch.from_numpy(page.images).movedim(-1, 1).float() / 127.5 - 1
-        self.backbone.codec.standardise(images, torch.from_numpy(page.silhouettes)[:, None])
+    def _begin_from(self, earlier: Backbone) -> None:
+        """Take an earlier backbone's weights. Raises `BadInput` when it has another shape or other words."""
+        if earlier.tokenizer.get_vocab() != self.backbone.tokenizer.get_vocab():
+            raise BadInput("--start: a backbone that knows other words than these people's captions have")
+        for name in (*TRAINED, "codec"):
+            try:
+                getattr(self.backbone, name).load_state_dict(getattr(earlier, name).state_dict())
+            except RuntimeError as error:
+                raise BadInput(f"--start: its {name} has another shape ({str(error).splitlines()[0]})") from error
+
+    def _standardise(self, crops: Crops) -> None:
+        page = crops.pages[0]
+        images = torch.from_numpy(page.images).to(self.device).movedim(-1, 1).float() / 127.5 - 1
+        person = torch.from_numpy(page.silhouettes).to(self.device)
+        self.backbone.codec.standardise(images, person[:, None])
+        self._weigh_channels()
+
+    def _weigh_channels(self) -> None:
         scale = self.backbone.codec.scale
         weight = scale**1.5  # between the pixels' own (2) and equal weight for every frequency (0)
         self.channel_weight = (weight / weight.mean())[:, None, None]
@@ -138,8 +134,8 @@ class MiniTrainer:
         losses: list[float] = []
         with self.progress.task("training mini", config.steps) as task:
             task.advance(self.step)
-            while self.step < config.steps:
-                losses.append(self._one_step())
+            for batch in self.batches.stream(self.step, config.steps, self.workers):
+                losses.append(self._one_step(batch))
                 self.step += 1
                 task.advance()
                 now = time.monotonic()
@@ -158,11 +154,11 @@ class MiniTrainer:
         left = (self.config.steps - self.step) / (0.25 * self.config.steps)
         return self.config.lr * min(1.0, (self.step + 1) / RISE) * min(1.0, left)
 
-    def _one_step(self) -> float:
+    def _one_step(self, batch: MiniBatch) -> float:
         for group in self.optimizer.param_groups:
             group["lr"] = self._rate()
         self.optimizer.zero_grad(set_to_none=True)
-        loss = self.loss(np.random.default_rng((self.config.seed, self.step)))
+        loss = self.loss(batch)
         value = loss.item()
         if not np.isfinite(value):
             raise Diverged(self.step, f"loss is {value}")
@@ -171,52 +167,33 @@ class MiniTrainer:
         self.optimizer.step()
         decay = min(self.config.average, (self.step + 1) / (self.step + 10))
         with torch.no_grad():
-            for name, p in self.named.items():
-                self.mean[name].lerp_(p, 1 - decay)
+            torch._foreach_lerp_(list(self.mean.values()), list(self.named.values()), 1 - decay)
         return value
 
-    def loss(self, rng: np.random.Generator) -> Tensor:
+    def loss(self, batch: MiniBatch) -> Tensor:
         """Weighted error of the clean latents over hidden blocks. SNR weights are clipped to [1, 5]."""
-        backbone, config = self.backbone, self.config
-        width, rows = self.crops.draw(rng)
-        images, silhouettes, labels = self.crops.images(width, rows)
-        hidden = torch.from_numpy(np.stack([random_mask(rng, s) for s in silhouettes]))[:, None].float()
-        pixels = torch.from_numpy(images).movedim(-1, 1).float() / 127.5 - 1
+        backbone, device = self.backbone, self.device
+        pixels = batch.images.to(device).movedim(-1, 1).float() / 127.5 - 1
+        person, hidden = (mask.to(device)[:, None].float() for mask in (batch.person, batch.hidden))
+        noise, timesteps = batch.noise.to(device), batch.timesteps.to(device)
         latents = backbone.codec.encode(pixels)
-        generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-        noise = torch.randn(latents.shape, generator=generator)
-        timesteps = torch.randint(0, backbone.scheduler.config.num_train_timesteps, (len(rows),), generator=generator)
         noisy = backbone.scheduler.add_noise(latents, noise, timesteps)
-        parts = None
-        if rng.random() < config.control:
-            parts = torch.from_numpy(part_colours(labels)).movedim(-1, 1).float() / 255
-        text = self._text(rng, rows[:, 2])
-        person = torch.from_numpy(silhouettes)[:, None].float()
-        predicted = backbone.predict(noisy, timesteps, backbone.condition(pixels, hidden, person), text, parts)
+        parts = self.colours[batch.labels.to(device).long()].movedim(-1, 1) if batch.use_parts else None
+        condition = backbone.condition(pixels, hidden, person)
+        with torch.autocast(device.type, torch.bfloat16, enabled=self.config.precision == "bfloat16"):
+            predicted = backbone.predict(noisy, timesteps, condition, self._text(batch), parts).float()
         body = shrink_mask(person, latents)
-        weight = shrink_mask(hidden, latents) * (config.background_weight + (1 - config.background_weight) * body)
+        weight = shrink_mask(hidden, latents)
+        weight = weight * (self.config.background_weight + (1 - self.config.background_weight) * body)
         error = ((predicted - backbone.target(latents, noise, timesteps)).square() * self.channel_weight).mean(1)
         per_sample = (error * weight[:, 0]).sum((1, 2)) / weight.sum((1, 2, 3)).clamp(min=1)
         return (per_sample * backbone.snr(timesteps).clamp(1, 5)).mean()
 
-    def _text(self, rng: np.random.Generator, people: NDArray[np.int64]) -> Tensor:
-        config = self.config
-        prompts, told = [], []
-        for person in people:
-            chance = rng.random()
-            told.append(chance < config.traits)
-            kept = [phrase for phrase in self.crops.phrases[person] if rng.random() < config.phrase_kept]
-            if chance < config.traits:
-                prompts.append(" ".join(["a photo of", *["person"] * TRAIT_TOKENS]))
-            elif chance < config.traits + config.captions and kept:
-                order = rng.permutation(len(kept))
-                prompts.append(f"{PERSON} with {' , '.join(kept[k] for k in order)}")
-            else:
-                prompts.append(PERSON)
-        self._traits = self.tokens(torch.from_numpy(self.crops.traits[people]))
-        self._told = torch.tensor(told)
+    def _text(self, batch: MiniBatch) -> Tensor:
+        self._traits = self.tokens(batch.traits.to(self.device))
+        self._told = batch.told.to(self.device)
         try:
-            return self.backbone.text(prompts)
+            return self.backbone.text(batch.prompts)
         finally:
             self._traits = None
 
@@ -225,7 +202,7 @@ class MiniTrainer:
         if self._traits is None:
             return None
         before = 4
-        spoken = torch.cat([vectors[:, :before], self._traits, vectors[:, before + TRAIT_TOKENS :]], 1)
+        spoken = torch.cat([vectors[:, :before], self._traits.to(vectors), vectors[:, before + TRAIT_TOKENS :]], 1)
         return torch.where(self._told[:, None, None], spoken, vectors)
 
     # --- keeping ---
@@ -236,7 +213,8 @@ class MiniTrainer:
             for name, p in self.named.items():
                 p.copy_(self.mean[name])
         for name in TRAINED:
-            getattr(self.backbone, name).eval().requires_grad_(False)
+            module = getattr(self.backbone, name).eval().requires_grad_(False)
+            module.to(memory_format=torch.contiguous_format)  # the only one that can be saved
         return self.backbone
 
     def save(self) -> None:
@@ -272,7 +250,7 @@ class MiniTrainer:
                     self.mean[name].copy_(tensors[f"mean.{name}"])
                     keys = ("step", "exp_avg", "exp_avg_sq")
                     if f"adam.{name}.step" in tensors:
-                        self.optimizer.state[p] = {key: tensors[f"adam.{name}.{key}"] for key in keys}
+                        self.optimizer.state[p] = {key: tensors[f"adam.{name}.{key}"].to(p.device) for key in keys}
         except (OSError, SafetensorError, KeyError, ValueError, RuntimeError) as error:
             raise BadInput(f"{path}: not a readable training state ({error}); remove it to start again") from error
         self.step, self.seconds = int(meta["step"]), float(meta["seconds"])

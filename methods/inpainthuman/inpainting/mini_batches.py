@@ -1,0 +1,130 @@
+"""The batches that `mini` learns from: what a step is fed is a function of (seed, step) alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+from ihbench.methods.inpainthuman.inpainting.crop_album import Page
+from ihbench.methods.inpainthuman.inpainting.mini_model import SIZE
+from ihbench.methods.inpainthuman.inpainting.mini_training import MiniTraining
+from ihbench.methods.inpainthuman.inpainting.random_mask import random_mask
+
+PERSON = "a photo of a person"
+TRAIT_TOKENS = 4
+USUAL_WIDTH = 0.75  # of a crop, as a share of its height
+
+
+class Crops:
+    """All crops of an album, by width."""
+
+    def __init__(self, pages: list[Page]):
+        starts = np.cumsum([0, *(len(page.phrases) for page in pages)])
+        self.pages = pages
+        self.phrases = [phrases for page in pages for phrases in page.phrases]
+        self.traits = np.concatenate([page.traits for page in pages])
+        self.by_width: dict[int, NDArray[np.int64]] = {}  # [n, 3] page, crop, person
+        for width in np.unique(np.concatenate([page.widths for page in pages])):
+            rows = []
+            for k, page in enumerate(pages):
+                crops = np.flatnonzero(page.widths == width)
+                rows.append(np.column_stack([np.full(len(crops), k), crops, starts[k] + page.person[crops]]))
+            self.by_width[int(width)] = np.concatenate(rows)
+        self.widths = sorted(self.by_width)
+        counts = np.array([len(self.by_width[w]) for w in self.widths], np.float64)
+        self.shares = counts / counts.sum()
+
+    def draw(self, rng: np.random.Generator, batch: int) -> tuple[int, NDArray[np.int64]]:
+        """A width, and as many crops of it as have the pixels of `batch` crops of the usual width."""
+        width = self.widths[int(rng.choice(len(self.widths), p=self.shares))]
+        rows = self.by_width[width]
+        size = max(round(batch * USUAL_WIDTH * SIZE / width), 1)
+        return width, rows[rng.choice(len(rows), size, replace=len(rows) < size)]
+
+    def images(self, width: int, rows: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray]:
+        """Images [B, S, W, 3], silhouettes [B, S, W] and part labels [B, S, W]."""
+        picked = [(self.pages[page], crop) for page, crop, _ in rows]
+        return (
+            np.stack([page.images[crop, :, :width] for page, crop in picked]),
+            np.stack([page.silhouettes[crop, :, :width] for page, crop in picked]),
+            np.stack([page.parts[crop, :, :width] for page, crop in picked]),
+        )
+
+
+@dataclass(frozen=True)
+class MiniBatch:
+    """One step's crops, occluders, noise and words."""
+
+    images: Tensor  # [B, S, W, 3] uint8
+    person: Tensor  # [B, S, W] bool
+    hidden: Tensor  # [B, S, W] bool
+    labels: Tensor  # [B, S, W] uint8
+    noise: Tensor  # [B, C, h, w]
+    timesteps: Tensor  # [B]
+    traits: Tensor  # [B, T]
+    told: Tensor  # [B] bool: the traits speak in the place of words
+    prompts: list[str]
+    use_parts: bool
+
+
+class Batches(Dataset[MiniBatch]):
+    """`batches[step]`."""
+
+    def __init__(self, config: MiniTraining, crops: Crops, channels: int, block: int, timesteps: int):
+        self.config, self.crops = config, crops
+        self.channels, self.block, self.timesteps = channels, block, timesteps
+
+    def __getitem__(self, step: int) -> MiniBatch:
+        config = self.config
+        rng = np.random.default_rng((config.seed, step))
+        width, rows = self.crops.draw(rng, config.batch)
+        images, person, labels = self.crops.images(width, rows)
+        hidden = np.stack([random_mask(rng, silhouette) for silhouette in person])
+        generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+        shape = (len(rows), self.channels, SIZE // self.block, width // self.block)
+        use_parts = bool(rng.random() < config.control)
+        prompts, told = self.words(rng, rows[:, 2])
+        return MiniBatch(
+            *(torch.from_numpy(array) for array in (images, person, hidden, labels)),
+            noise=torch.randn(shape, generator=generator),
+            timesteps=torch.randint(0, self.timesteps, (len(rows),), generator=generator),
+            traits=torch.from_numpy(self.crops.traits[rows[:, 2]]),
+            told=torch.tensor(told),
+            prompts=prompts,
+            use_parts=use_parts,
+        )
+
+    def words(self, rng: np.random.Generator, people: NDArray[np.int64]) -> tuple[list[str], list[bool]]:
+        """A prompt for each, and whether trait tokens speak in it."""
+        config = self.config
+        prompts, told = [], []
+        for person in people:
+            chance = rng.random()
+            told.append(bool(chance < config.traits))
+            kept = [phrase for phrase in self.crops.phrases[person] if rng.random() < config.phrase_kept]
+            if chance < config.traits:
+                prompts.append(" ".join(["a photo of", *["person"] * TRAIT_TOKENS]))
+            elif chance < config.traits + config.captions and kept:
+                order = rng.permutation(len(kept))
+                prompts.append(f"{PERSON} with {' , '.join(kept[k] for k in order)}")
+            else:
+                prompts.append(PERSON)
+        return prompts, told
+
+    def stream(self, first: int, last: int, workers: int) -> Iterator[MiniBatch]:
+        """Batches of steps `first` to `last` - 1, made by worker processes ahead of their time."""
+        return iter(
+            DataLoader(
+                self,
+                batch_size=None,
+                sampler=range(first, last),
+                num_workers=workers,
+                prefetch_factor=4 if workers else None,
+            )
+        )
