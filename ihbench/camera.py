@@ -111,11 +111,19 @@ def distort(x: Array, y: Array, coefficients: Array) -> tuple[Array, Array]:
 def look_at(
     eye: Array, target: Array, up: Array | tuple[float, float, float] = (0.0, 1.0, 0.0)
 ) -> tuple[Array, Array]:
-    """R [3, 3], t [3] of a camera at `eye` m that looks at `target` m, with `up` pointing up in the image."""
+    """R [3, 3], t [3] of a camera at `eye` m that looks at `target` m, with `up` pointing up in the image.
+
+    Raises ValueError when eye and target are one point, and when the camera looks along `up`.
+    """
     eye, target = np.asarray(eye, np.float64), np.asarray(target, np.float64)
     z = target - eye
-    z /= np.linalg.norm(z)
     x = np.cross(z, np.asarray(up, np.float64))
-    x /= np.linalg.norm(x)
+    across = np.linalg.norm(x)
+    if not across > 1e-12 * np.linalg.norm(z) * np.linalg.norm(up):
+        raise ValueError(
+            f"look_at: expected a view direction that is not along up, got eye {eye}, target {target}, up {up}"
+        )
+    z /= np.linalg.norm(z)
+    x /= across
     R = np.stack([x, np.cross(z, x), z])
     return R, -R @ eye

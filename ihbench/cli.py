@@ -18,10 +18,12 @@ COMMANDS = {
     "data": "check a data folder, or write a stand-in capture",
     "score": "score a folder of images that somebody else's code rendered",
     "prepare": "hand out the occluded training set for other people's code",
-    "report": "tables of finished runs",
+    "ablate": "what each component of a method is worth, in quality and in seconds",
+    "report": "tables of finished runs, and error against run time",
     "metrics": "check every metric against oracles, other libraries and stored values",
     "weights": "learned weights the bench may not ship: list, where, fetch",
     "export": "an avatar's Gaussians as a splat PLY",
+    "stress": "stiff and extreme cases with known answers, case by case",
     "kernels": "error against milliseconds for the bench's own kernels",
 }
 

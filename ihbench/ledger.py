@@ -125,6 +125,20 @@ class Ledger:
         with self._charging((*self._chain, *(path[:i] for i in cuts))):
             yield
 
+    def book(self, name: str, seconds: float, cpu_seconds: float = 0.0) -> None:
+        """Charge time that passed before there was a ledger to a stage of its own, and to the total. Raises
+        `ValueError` for negative seconds and for a name that is no plain word."""
+        if not STAGE_NAME.fullmatch(name) or "/" in name or not seconds >= 0:
+            raise ValueError(f"stage: expected a word and seconds of 0 or more, got {name!r}, {seconds}")
+        self._charge()
+        stage = self._stages.setdefault(name, Stage())
+        stage.seconds += seconds
+        stage.cpu_seconds += cpu_seconds
+        stage.peak_mb = machine.peak_memory_mb()
+        stage.entered += 1
+        self._total += seconds
+        self._total_cpu += cpu_seconds
+
     @contextmanager
     def paused(self) -> Iterator[None]:
         """Stop the clocks of all open stages and charge what happens inside to `evaluate`."""
@@ -301,7 +315,7 @@ class Ledger:
         the stage last ended.
         """
         self._charge()
-        rows = [_row(path, self._stages[path], self._total) for path in _in_order(self._stages)]
+        rows = [_row(path, self._stages[path], self._total) for path in in_order(self._stages)]
         top = [stage for path, stage in self._stages.items() if "/" not in path]
         other = Stage(
             self._total - sum(stage.seconds for stage in top),
@@ -318,12 +332,12 @@ def _row(path: str, stage: Stage, total: float) -> dict[str, Any]:
     return {"stage": path, "depth": path.count("/"), "share": share, **asdict(stage)}
 
 
-def _in_order(paths: Mapping[str, Stage], parent: str = "") -> Iterator[str]:
+def in_order(paths: Mapping[str, Any], parent: str = "") -> Iterator[str]:
     """Paths in the order they were first opened, each followed by what it contains."""
     for path in paths:
         if path.rpartition("/")[0] == parent:
             yield path
-            yield from _in_order(paths, path)
+            yield from in_order(paths, path)
 
 
 def _stages(record: Mapping[str, Any]) -> dict[str, Stage]:
@@ -332,6 +346,11 @@ def _stages(record: Mapping[str, Any]) -> dict[str, Stage]:
 
 def _root(path: str) -> str:
     return path.partition("/")[0]
+
+
+def saved_meta(file: Path) -> dict[str, Any]:
+    """The meta of a saved state's file. Raises `ValueError`, or what the reader raises, when it is damaged."""
+    return decode(_unpack(file.read_bytes())[1]["meta"])
 
 
 def _copies(tensors: Mapping[str, Any]) -> dict[str, Any]:

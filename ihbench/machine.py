@@ -11,6 +11,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+BUSY = 1.5  # load average per usable core above which other work was in the way: one run alone brings about 1
+
 
 def identity() -> dict[str, Any]:
     """Processor, cores, memory, Python, torch and load: what somebody needs to judge a time in seconds.
@@ -30,6 +32,15 @@ def identity() -> dict[str, Any]:
         "gpu": sys.modules["torch"].cuda.get_device_name() if _cuda_in_use() else None,
         "load_average": [round(value, 2) for value in os.getloadavg()] if hasattr(os, "getloadavg") else None,
     }
+
+
+def identity_at_end(before: dict[str, Any]) -> dict[str, Any]:
+    """The identity as it is known when torch and the device have been used, with the load of both moments.
+
+    `load_average` stays that of the beginning, which the run itself has no part in; `load_average_end` has one.
+    """
+    now = identity()
+    return now | {"load_average": before.get("load_average"), "load_average_end": now["load_average"]}
 
 
 def cpu_model() -> str:
@@ -74,8 +85,10 @@ def peak_memory_mb() -> float:
 def reset_peak_memory() -> bool:
     """Forget the peak so far, so that one run's peak is not charged to the next in the same process.
 
-    True where that is possible (Linux).
+    True where that is possible (Linux). The GPU's peak is forgotten as well, where one is in use.
     """
+    if _cuda_in_use():
+        sys.modules["torch"].cuda.reset_peak_memory_stats()
     try:
         Path("/proc/self/clear_refs").write_text("5")
     except OSError:
@@ -111,6 +124,20 @@ def synchronize(device: str = "cpu") -> None:
         torch.cuda.synchronize(device)
     elif kind == "mps" and torch.backends.mps.is_available():
         torch.mps.synchronize()
+
+
+def warm_up(device: str = "cpu") -> None:
+    """Let a GPU's libraries start: the first product and the first convolution take seconds, which belong to no
+    method. Nothing on a CPU."""
+    if str(device).partition(":")[0] != "cuda":
+        return
+    import torch
+
+    image = torch.ones(1, 4, 8, 8, device=device, requires_grad=True)
+    kernel = torch.ones(4, 4, 3, 3, device=device, requires_grad=True)
+    drawn = torch.nn.functional.conv2d(image, kernel)
+    (drawn.flatten(1) @ drawn.flatten(1).T).sum().backward()
+    synchronize(device)
 
 
 def _cuda_in_use() -> bool:

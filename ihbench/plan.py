@@ -5,7 +5,8 @@ Nothing here imports torch or cv2: `ihbench plan` answers fast.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,11 +32,20 @@ TEXELS = 128  # side of the UV grid on which visibility is measured
 
 @dataclass(frozen=True)
 class Omission:
-    """Something left out of a run. `field` is a config field of the method, or a region of the protocol."""
+    """Something left out of a run. `field` is a config field of the method, or a region of the protocol.
+
+    `spares` says which share of a stage's seconds this is thought to save: ledger path -> 0 to 1.
+    """
 
     field: str
     value: Any
     reason: str
+    spares: Mapping[str, float] = field(default_factory=dict)
+
+    def seconds(self, stages: Mapping[str, float]) -> float | None:
+        """What this saves in those of its stages whose seconds are known; None when none is."""
+        known = [share * stages[path] for path, share in self.spares.items() if path in stages]
+        return sum(known) if known else None
 
 
 @dataclass(frozen=True)
@@ -144,15 +154,31 @@ def _turn(roots: NDArray[np.float64]) -> float:  # [F, 3] rad
 
 def expected_seconds(runs: Path, method: str, profile: str) -> float | None:
     """Median total seconds of finished runs of this method and profile under `runs`; None without any."""
-    seconds = []
-    for path in runs.glob("*/run.json"):
+    seconds = [float(about["total_seconds"]) for about, _ in _finished(runs, method, profile)]
+    return float(np.median(seconds)) if seconds else None
+
+
+def stage_seconds(runs: Path, method: str, profile: str) -> dict[str, float]:
+    """Ledger path -> median seconds, over those finished runs of this method and profile that had the stage."""
+    found: dict[str, list[float]] = {}
+    for _, ledger in _finished(runs, method, profile):
+        for path, stage in ledger["stages"].items():
+            found.setdefault(path, []).append(float(stage["seconds"]))
+    return {path: float(np.median(seconds)) for path, seconds in found.items()}
+
+
+def _finished(runs: Path, method: str, profile: str) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
+    """`about` and ledger of the finished runs. A damaged record tells nothing about time and is passed over."""
+    for path in sorted(runs.glob("*/run.json")):
         try:
             record = read_json(path)
-            if record["status"] == "done" and (record["identity"]["method"], record["identity"]["profile"]) == (
-                method,
-                profile,
-            ):
-                seconds.append(float(record["about"]["total_seconds"]))
-        except (BadInput, KeyError, TypeError, ValueError):
-            continue  # a damaged record tells nothing about time
-    return float(np.median(seconds)) if seconds else None
+            identity = record["identity"]
+            if record["status"] != "done" or (identity["method"], identity["profile"]) != (method, profile):
+                continue
+            about, ledger = record["about"], record["ledger"]
+            float(about["total_seconds"])
+            for stage in ledger["stages"].values():
+                float(stage["seconds"])
+        except (BadInput, AttributeError, KeyError, TypeError, ValueError):
+            continue
+        yield about, ledger

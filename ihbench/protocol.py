@@ -159,6 +159,18 @@ class Protocol:
         content["subjects"] = {k: v for k, v in content["subjects"].items() if k != "spans"}
         return replace(_build(content, self.profile), version=version)
 
+    def with_size(self, size: int | None) -> Protocol:
+        """The same protocol with images of another size (px, the longer side); its digest differs.
+
+        Raises `BadInput` for a size outside 8 to 8192.
+        """
+        if size is None or size == self.image.size:
+            return self
+        if not 8 <= size <= 8192:
+            raise BadInput(f"--image-size {size}: expected 8 to 8192 px")
+        replaced = _build({**self.content, "image": {**self.content["image"], "size": size}}, self.profile)
+        return replace(replaced, version=f"{self.version}+size={size}")
+
     def training_frames(self, subject: str, n_frames: int) -> list[int]:
         """Raw frame numbers of the training images."""
         span = self.spans[subject][0] if subject in self.spans else self.train_frames

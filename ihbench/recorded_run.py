@@ -68,7 +68,8 @@ class RecordedRun(ABC):
             self.progress.say(f"the run's record could not be written: {error}")
 
     def describe(self, **more: Any) -> None:
-        """Put the clocks, the peak memory and more into the record."""
+        """Put the clocks, the peak memory, what the machine has turned out to be, and more into the record."""
+        self.folder.record["machine"] = machine.identity_at_end(self.folder.record["machine"])
         self.folder.record["about"] |= {
             "fit_seconds": self.ledger.fit_seconds,
             "total_seconds": self.ledger.seconds,

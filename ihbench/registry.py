@@ -22,9 +22,15 @@ GROUPS = {
     "training layout": "ihbench.training_layouts",
     "people": "ihbench.people",
     "command": "ihbench.commands",
+    "ladder": "ihbench.ladders",
+    "table": "ihbench.tables",
+    "stress cases": "ihbench.stress",
     "protocol": "ihbench.protocols",
     "occlusion": "ihbench.occlusions",
     "report": "ihbench.reports",
+    "report verb": "ihbench.report_verbs",
+    "figure": "ihbench.figures",
+    "kernel": "ihbench.kernels",
     "metric preset": "ihbench.presets",
 }
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,16 @@ class RunResult:
         """Runs of one group may stand in one table: protocol, its digest, profile, which data."""
         identity = self.identity
         return identity["protocol"], identity["protocol_digest"], identity["profile"], self.data
+
+    @cached_property
+    def curve(self) -> list[dict[str, Any]]:
+        """Quality-time points, see `RunFolder.add_curve_point`; none where there is no file, or a damaged one."""
+        file = self.folder / "curve.jsonl"
+        try:
+            points = atomic.read_json_lines(file) if file.is_file() else []
+            return [point for point in points if float(point["seconds"]) >= 0 and isinstance(point["scores"], dict)]
+        except (BadInput, KeyError, TypeError, ValueError):
+            return []
 
     @property
     def data(self) -> str:

@@ -7,6 +7,7 @@ divergence and interruption are outcomes with a reason.
 from __future__ import annotations
 
 import hashlib
+import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench import __version__, registry
+from ihbench import __version__, machine, registry
 from ihbench.capture_digest import capture_digest
 from ihbench.config_fields import flat, with_fields
 from ihbench.data_source import DataSource, locate
@@ -53,6 +54,7 @@ class RunRequest:
     body: Path | None = None  # SMPL model file, for real data
     force: bool = False  # do it again even if it is done
     keep: tuple[str, ...] = ()  # fields that the plan must not change; "all" for none
+    share: bool = False  # take saved states from other runs where they would come out the same
 
 
 def run(
@@ -115,15 +117,17 @@ def configuration(method: str, profile: str, switches: dict[str, Any]) -> Any:
 
 def run_scene(request: RunRequest, source: DataSource, scene: str, progress: Progress) -> RunResult:
     """Run on one scene, or find the finished run."""
+    began = time.perf_counter(), time.process_time()
     capture, body = source.open(scene, request.body, progress)
     identity = run_identity(request, capture, body)
     about = about_scene(capture, request.protocol) | {"device": request.device}
+    opened = time.perf_counter() - began[0], time.process_time() - began[1]
     return recorded(
         request.runs,
         identity,
         about,
         request.force,
-        lambda folder: _Run(request, capture, body, folder, progress),
+        lambda folder: _Run(request, capture, body, folder, progress, opened),
     )
 
 
@@ -159,13 +163,23 @@ def load_avatar(folder: Path, data: Path | None, body: Path | None) -> tuple[Any
 class _Run(RecordedRun):
     """One run of a method in progress: its parts, in the order in which they happen."""
 
-    def __init__(self, request: RunRequest, capture: Capture, body: Body, folder: RunFolder, progress: Progress):
+    def __init__(
+        self,
+        request: RunRequest,
+        capture: Capture,
+        body: Body,
+        folder: RunFolder,
+        progress: Progress,
+        opened: tuple[float, float] = (0.0, 0.0),  # s, wall and CPU, that opening the scene took
+    ):
         super().__init__(folder, progress, request.device, self._curve_point)
+        self.ledger.book("open", *opened)
         self.request, self.capture, self.body = request, capture, body
         self.scorer: Scorer | None = None
 
     def work(self) -> None:
-        from ihbench.render.splat import warm_up  # brings torch, which `ihbench plan` must not load
+        with self.ledger.stage("import"):
+            from ihbench.render.splat import warm_up  # brings torch, which `ihbench plan` must not load
 
         request, protocol = self.request, self.request.protocol
         with self.ledger.stage("occlude"):
@@ -176,6 +190,7 @@ class _Run(RecordedRun):
                 config, left_out = _planned(request, measure)
             with self.ledger.stage("compile"):
                 method: Method = registry.load("method", request.method)(config)
+                machine.warm_up(request.device)
                 warm_up(request.device)
             with self.ledger.stage("load"):
                 preloading.wait()
@@ -189,17 +204,32 @@ class _Run(RecordedRun):
         )
         self.folder.set_status("running", ledger=self.ledger)
         training = TrainingSet(scene.train, self.body, protocol.image.background, self.capture.name)
+        if request.share:
+            self._take_shared_states()
         with self.ledger.stage("fit"):
             avatar = method.fit(
                 training, device=request.device, seed=request.seed, ledger=self.ledger, progress=self.progress
             )
-        avatar.save(self.folder.path / "avatar")
+        with self.ledger.stage("save"):
+            avatar.save(self.folder.path / "avatar")
         self.folder.set_status("running", ledger=self.ledger)
         with self.ledger.stage("score"):
             stage = ScoreStage(self.scorer, self.body, self.folder, request.runs, self.progress, request.force)
             stage.run(request.method, lambda loaded: self._render(avatar, loaded.view))
         self.describe()
         self.folder.set_status("done", ledger=self.ledger)
+
+    def _take_shared_states(self) -> None:
+        """Copy saved states of finished runs that differ only in fields on which these states do not depend. Their
+        seconds count as this run's own: the clock is saved with a state."""
+        from ihbench.shared_states import lend, lender
+
+        states = getattr(registry.load("config", self.request.method), "SHARED_STATES", {})
+        for state, free in states.items():
+            other = lender(self.request.runs, self.folder, state, free)
+            if other is not None:
+                lend(other, self.folder, state)
+                self.ledger.event("shared", state=state, run=other.record["digest"])
 
     def _render(self, avatar: Avatar, view: TestView) -> NDArray[np.float32]:
         return avatar.render(view.camera, view.body_pose, self.request.protocol.image.background)[0]

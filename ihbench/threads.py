@@ -12,6 +12,19 @@ _restore: list = []
 
 
 @contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """torch works on one thread: tensors that are small wait longer for a second one than they work."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@contextmanager
 def single_threaded_libraries() -> Iterator[None]:
     """BLAS and OpenCV work on one thread each while the caller's own threads do the work side by side.
 

@@ -1,4 +1,4 @@
-"""What runs painted, and what is claimed of it: identity drift, flicker, and what each stage cost."""
+"""What runs painted, and what is claimed of it: identity drift and flicker."""
 
 from __future__ import annotations
 
@@ -6,24 +6,19 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from ihbench.reports.document import Block, Heading, Paragraph, Table, Words
 from ihbench.results import RunResult
 
 EVENT = "inpainted"
 
 
-def inpainting_section(labelled: Mapping[str, Sequence[RunResult]]) -> list[str]:
+def inpainting_section(labelled: Mapping[str, Sequence[RunResult]]) -> list[Block]:
     """A table over the runs that painted something; nothing without any."""
     found = {label: [e for run in runs for e in _painted(run)] for label, runs in labelled.items()}
     found = {label: events for label, events in found.items() if events}
     if not found:
         return []
-    lines = [
-        "",
-        "### Inpainting",
-        "",
-        "| method | runs | views painted | pixels | drift ΔE (floor) | texture (floor) | flicker (floor) |",
-        "|---|---:|---:|---:|---:|---:|---:|",
-    ]
+    rows: list[tuple[Words, ...]] = []
     for label, events in found.items():
         drifts = [event["identity_drift"] for event in events]
         flickers = [event["flicker"] for event in events]
@@ -35,25 +30,16 @@ def inpainting_section(labelled: Mapping[str, Sequence[RunResult]]) -> list[str]
             _pair(drifts, "texture", "texture_floor", 1),
             _pair(flickers, "deviation", "deviation_floor", 3),
         ]
-        lines.append(f"| {label} | {' | '.join(cells)} |")
+        rows.append((label, *cells))
+    head = ("method", "runs", "views painted", "pixels", "drift ΔE (floor)", "texture (floor)", "flicker (floor)")
     return [
-        *lines,
-        "",
-        "Drift: painted surface against the mean of what other views show of it; flicker: standard deviation of "
-        "painted surface over views. Floors: the same for surface that was seen, lighting and resampling alone.",
+        Heading(3, "Inpainting"),
+        Table(head, tuple(rows)),
+        Paragraph(
+            "Drift: painted surface against the mean of what other views show of it; flicker: standard deviation of "
+            "painted surface over views. Floors: the same for surface that was seen, lighting and resampling alone."
+        ),
     ]
-
-
-def stage_lines(runs: Sequence[RunResult]) -> list[str]:
-    """One line per run that has stages inside its fit: their seconds."""
-    lines = []
-    for run in runs:
-        stages = (run.record.get("ledger") or {}).get("stages", {})
-        inner = {path[4:]: stage["seconds"] for path, stage in stages.items() if path.startswith("fit/")}
-        told = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in inner.items() if "/" not in name)
-        if "stage2" in inner:
-            lines.append(f"- fit of {run.scene}, seed {run.identity['seed']}: {told}")
-    return lines
 
 
 def _painted(run: RunResult) -> list[dict[str, Any]]:

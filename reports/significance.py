@@ -8,9 +8,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from ihbench.metrics import Identity, macro_mean
+from ihbench.metrics import Identity, Mean, macro_mean
 from ihbench.metrics.identity import Metric, metric_of
 from ihbench.metrics.statistics import holm, mean_interval, paired_test, smallest_detectable_difference
+from ihbench.reports.document import Block, Heading, Paragraph, Table, Words, bullets
 from ihbench.results import RunResult
 
 LEVEL = 0.95
@@ -22,16 +23,14 @@ def intervals_section(
     by_label: Mapping[str, Sequence[RunResult]],  # a table row's label -> its runs
     identities: Sequence[str],
     headline: str,
-) -> list[str]:
-    """Lines of Markdown; none where there is but one scene."""
+) -> list[Block]:
+    """A table of means with intervals, and the comparisons; nothing where there is but one scene."""
     columns = [i for i in identities if Identity.parse(i).region == headline]
-    values = {i: {label: _per_scene(runs, i) for label, runs in by_label.items()} for i in columns}
+    values = {i: {label: per_scene(runs, i) for label, runs in by_label.items()} for i in columns}
     columns = [i for i in columns if any(len(found) >= 2 for found in values[i].values())]
     if not columns:
         return []
-    lines = ["", f"### {headline}: mean over scenes and {LEVEL:.0%} interval", ""]
-    lines.append("| method | " + " | ".join(f"{metric_of(i).title} {metric_of(i).arrow}" for i in columns) + " |")
-    lines.append("|---|" + "---:|" * len(columns))
+    rows: list[tuple[Words, ...]] = []
     methods: set[str] = set()
     for label in by_label:
         cells = []
@@ -47,22 +46,31 @@ def intervals_section(
             if math.isfinite(interval.low):
                 shown += f" [{text(interval.low)}, {text(interval.high)}]"
             cells.append(shown)
-        lines.append(f"| {label} | " + " | ".join(cells) + " |")
-    lines += ["", f"Intervals: {'; '.join(sorted(methods))}."]
-    for i in columns:
-        lines += _comparisons(values[i], metric_of(i))
-    return lines
+        rows.append((label, *cells))
+    head = ("method", *(f"{metric_of(i).title} {metric_of(i).arrow}" for i in columns))
+    return [
+        Heading(3, f"{headline}: mean over scenes and {LEVEL:.0%} interval"),
+        Table(head, tuple(rows)),
+        Paragraph(f"Intervals: {'; '.join(sorted(methods))}."),
+        *bullets([line for i in columns for line in _comparisons(values[i], metric_of(i))]),
+    ]
 
 
-def _per_scene(runs: Sequence[RunResult], identity: str) -> dict[str, float]:
+def per_scene(runs: Sequence[RunResult], identity: str, row: str | None = None) -> dict[str, float]:
     """Scene -> mean over its runs (seeds); scenes without a finite number are left out."""
-    by_scene: dict[str, dict[str, object]] = {}
+    found = scene_means(runs, identity, row)
+    return {scene: mean.value for scene, mean in found.items() if math.isfinite(mean.value)}
+
+
+def scene_means(runs: Sequence[RunResult], identity: str, row: str | None = None) -> dict[str, Mean]:
+    """Scene -> mean over its runs (seeds), absent and infinite ones included. `row` names another row of the runs'
+    scores than the method's own, such as a calibration row or a group of test views."""
+    by_scene: dict[str, dict[str, Mean]] = {}
     for k, run in enumerate(runs):
-        mean = run.rows[run.method].get(identity)
+        mean = run.rows.get(row or run.method, {}).get(identity)
         if mean is not None:
             by_scene.setdefault(run.scene, {})[str(k)] = mean
-    means = {scene: macro_mean(found).value for scene, found in by_scene.items()}  # type: ignore[arg-type]
-    return {scene: value for scene, value in means.items() if math.isfinite(value)}
+    return {scene: macro_mean(found) for scene, found in by_scene.items()}
 
 
 def _comparisons(values: Mapping[str, Mapping[str, float]], metric: Metric) -> list[str]:
@@ -93,7 +101,7 @@ def _comparisons(values: Mapping[str, Mapping[str, float]], metric: Metric) -> l
         if test.smallest_p >= ALPHA:
             verdict = f"cannot be significant: {len(differences)} scenes allow no p below {test.smallest_p:.2g}"
         lines.append(
-            f"- {metric.title}: {best} against {label}: "
+            f"{metric.title}: {best} against {label}: "
             f"{test.interval.value * metric.scale:+.{metric.decimals}f}{spread}{unit}, "
             f"p = {adjusted[label]:.2g} (sign-flip test over {len(differences)} scenes, Holm over {len(tests)}), "
             f"{verdict}; a true difference of {smallest:.{metric.decimals}f}{unit} would be found "

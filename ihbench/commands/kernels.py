@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated
 
 import tyro
@@ -14,6 +15,10 @@ from ihbench.commands.parse import options
 class KernelOptions:
     kernel: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """Kernels to measure; none means all."""
+    figure: Path | None = None
+    """Folder for the work-precision diagram: PNG, SVG, and the numbers as CSV."""
+    repeats: int = 15
+    """How often each is timed."""
     json: bool = False
     """Print one JSON object on stdout."""
 
@@ -24,5 +29,5 @@ def main(argv: list[str]) -> int:
     )
     from ihbench.kernels.table import run_kernels
 
-    run_kernels(chosen.kernel, chosen.json)
+    run_kernels(chosen.kernel, chosen.json, chosen.repeats, chosen.figure)
     return 0

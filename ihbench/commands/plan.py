@@ -31,13 +31,14 @@ def main(argv: list[str]) -> int:
 
 def _planned(chosen: SceneChoice, protocol: Protocol) -> dict[str, Any]:
     from ihbench.data_source import locate, open_capture
-    from ihbench.plan import absent_regions, expected_seconds, measure_scene
+    from ihbench.plan import absent_regions, expected_seconds, measure_scene, stage_seconds
     from ihbench.run_loop import configuration
 
     config = configuration(chosen.method, chosen.profile, {})
     leave_out = registry.load("config", chosen.method).leave_out
     source = locate(protocol, chosen.data, chosen.scene)
     expected = expected_seconds(chosen.runs, chosen.method, chosen.profile)
+    stages = stage_seconds(chosen.runs, chosen.method, chosen.profile)
     report = {
         "protocol": protocol.name,
         "profile": chosen.profile,
@@ -60,7 +61,10 @@ def _planned(chosen: SceneChoice, protocol: Protocol) -> dict[str, Any]:
             report["scenes"][scene] = {"note": f"the run makes the rest of this stand-in; measured then: {error}"}
             continue
         omissions = leave_out(config, measure) + absent_regions(measure, protocol.regions)
-        report["scenes"][scene] = {"measure": asdict(measure), "left_out": [asdict(o) for o in omissions]}
+        report["scenes"][scene] = {
+            "measure": asdict(measure),
+            "left_out": [asdict(o) | {"seconds": o.seconds(stages)} for o in omissions],
+        }
     return report
 
 
@@ -87,6 +91,9 @@ def _print(report: dict) -> None:
         print(f"  joints move up to {m['motion_deg']:.0f}°, the person turns {m['turn_deg']:.0f}°")
         print(f"  a pixel of the protocol's image covers {m['pixel_mm']:.1f} mm of the body")
         for o in found["left_out"]:
-            print(f"  left out: {o['field']} -> {o['value']}: {o['reason']}")
+            saved = f" (saves about {o['seconds']:.0f} s)" if o["seconds"] is not None else ""
+            print(f"  left out: {o['field']} -> {o['value']}: {o['reason']}{saved}")
+        if any(o["value"] is not None for o in found["left_out"]):
+            print("  `ihbench run --keep FIELD` keeps what the plan would change, `--keep all` everything")
         if not found["left_out"]:
             print("  left out: nothing; this scene needs all of it")

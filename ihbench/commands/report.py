@@ -1,4 +1,4 @@
-"""`ihbench report`: tables of finished runs."""
+"""`ihbench report`: tables of finished runs, and the verbs that other rooms register under it."""
 
 from __future__ import annotations
 
@@ -39,14 +39,23 @@ class ReportOptions:
     body: Path | None = None
     """SMPL model file, likewise."""
     format: str = "md"
-    """A registered report."""
+    """A registered report: md, tex (booktabs, for pdflatex), html (one file with its pictures inside)."""
+    figures: Path | None = None
+    """Folder for diagrams of error against run time: PNG, SVG, and their numbers as CSV."""
+    target: tuple[str, ...] = ()
+    """Qualities whose time is asked for, as psnr=25, flip=0.15 or psnr/hidden=20; without them round ones."""
     out: Path | None = None
     """File to write; without it the report goes to stdout."""
 
 
 def main(argv: list[str]) -> int:
-    chosen = options(ReportOptions, argv, "report", "Tables of finished runs.")
+    verbs = registry.names("report verb")
+    if argv and argv[0] in verbs:  # a run folder of that name is still ./NAME
+        return registry.load("report verb", argv[0]).main(argv[1:])
+    about = f"Tables of finished runs. Also: ihbench report {' | '.join(verbs)}, each with its --help."
+    chosen = options(ReportOptions, argv, "report", about)
     from ihbench.metrics.evaluate import find_preset
+    from ihbench.quality_time import Target
     from ihbench.results import read_result
 
     write = registry.load("report", chosen.format)
@@ -57,6 +66,7 @@ def main(argv: list[str]) -> int:
             "make one with: ihbench run --protocol zju_occ --scene standin-1"
         )
     results = []
+    targets = [Target.parse(text) for text in chosen.target]
     for name in chosen.preset:
         find_preset(name)
     for folder in folders:
@@ -68,7 +78,12 @@ def main(argv: list[str]) -> int:
             print(f"ihbench: left out: {error}", file=sys.stderr)
     if chosen.preset:
         results = [_with_presets(result, chosen) for result in results]
-    text = write(results, chosen.preset)
+    pictures: list[tuple[Path, str]] = []
+    if chosen.figures is not None:
+        for name in registry.names("figure"):
+            pictures += registry.load("figure", name)(results, chosen.figures)
+    folder = Path(".") if chosen.out is None else chosen.out.parent
+    text = write(results, chosen.preset, targets=targets, pictures=pictures, folder=folder)
     if chosen.out is None:
         print(text, end="")
     else:

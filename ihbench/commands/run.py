@@ -57,7 +57,7 @@ def _with_switches(method: str, profile: str) -> type[RunOptions]:
 
 def _run(chosen: Any) -> int:
     if chosen.device == "cuda":
-        _require_cuda()
+        require_cuda()
     from dataclasses import replace
 
     from ihbench.data_source import locate
@@ -104,7 +104,8 @@ def _check_keep(keep: tuple[str, ...], config: Any) -> None:
             raise BadInput(f"--keep {name}: no such switch: {registry.nearest(name, known)}")
 
 
-def _require_cuda() -> None:
+def require_cuda() -> None:
+    """Raises `BadInput` where there is no CUDA device."""
     import torch
 
     if not torch.cuda.is_available():

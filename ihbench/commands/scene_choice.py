@@ -33,12 +33,14 @@ class ProtocolChanges:
     """Other training frames, START:STOP:STEP."""
     test_frames: str | None = None
     """Other (held-out) test frames, START:STOP:STEP."""
+    image_size: int | None = None
+    """Other image size, px of the longer side, for training and test images alike."""
 
     def apply(self, protocol: Protocol) -> list[Protocol]:
         """The protocols that these options mean: one, or one for each severity. Raises `BadInput`."""
         if self.occlusion.rule is not None:
             registry.entry_point("occlusion", self.occlusion.rule)
-        protocol = protocol.with_frames(self.train_frames, self.test_frames)
+        protocol = protocol.with_frames(self.train_frames, self.test_frames).with_size(self.image_size)
         fractions = tuple(dict.fromkeys(self.occlusion.fraction)) or (None,)
         return [protocol.with_occlusion(self.occlusion.rule, f, self.occlusion.covers) for f in fractions]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -14,6 +15,13 @@ Row = dict[str, Any]
 UNSTABLE = 0.25  # a spread above this share of the median is marked
 
 Sample = tuple[float, float | None]  # ms forward, ms backward
+
+
+def timed(step: Callable[[], object]) -> Sample:
+    """Milliseconds of something that has no backward pass."""
+    start = time.perf_counter()
+    step()
+    return (time.perf_counter() - start) * 1e3, None
 
 
 def interleave(steps: dict[str, Callable[[], Sample]], repeats: int, warm_up: int = 2) -> dict[str, list[Sample]]:

@@ -1,14 +1,13 @@
 """The metrics: their times on a 512² frame beside other people's libraries, and their errors against the oracles.
 
-Errors are those of the mean over a smaller pair of images of the same kind, where the oracle takes seconds; LPIPS has
-no oracle but the package it calls. Libraries that are not installed have no row.
+Errors are those of the mean over a smaller pair of images of the same kind, where the oracle takes seconds; that of
+LPIPS is the package it calls, in float64. Libraries that are not installed have no row.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
@@ -17,15 +16,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ihbench.errors import BadInput
 from ihbench.kernels.measuring import Row, interleave, peak_mib, summary
 from ihbench.metrics.cases import Case, hashed, person_case
-from ihbench.threads import single_threaded_libraries
+from ihbench.threads import one_torch_thread, single_threaded_libraries
 
 if TYPE_CHECKING:
     from ihbench.metrics.evaluate import Preset
+    from ihbench.metrics.lpips import Network
 
 SIZE = 512  # px; side of the timed frames
 ERROR_SIZE = 48, 40  # px; of the frames that an oracle looks at
+LPIPS_ERROR_SIZE = 320  # px; of the pair that the package sees in float64: three tiles a side
+LPIPS_TILE = 128  # px; a multiple of every trunk's stride
+TILED = "tiled"
 DTYPES = (np.uint8, np.float16, np.float32, np.float64)
 WHITE = (1.0, 1.0, 1.0)
 FIGURES = {"1/20": (0.55, 0.27), "1/10": (0.75, 0.4), "1/3": (1.0, 1.0)}  # share of the frame -> of height, width
@@ -76,25 +80,82 @@ def flip_rows(repeats: int, size: int = SIZE) -> list[Row]:
     return _compared("flip", "a person", size, person_case, steps, oracle, repeats)
 
 
-def lpips_rows(repeats: int, size: int = SIZE) -> list[Row]:
-    """LPIPS of a frame through every trunk (with random weights, which cost the same): ours against the package."""
+def lpips_rows(repeats: int, size: int = SIZE, nets: Sequence[str] | None = None) -> list[Row]:
+    """LPIPS of a frame through every trunk: ours whole and in tiles, and a person's crop, beside the package.
+
+    Where a trunk's weights are not here it gets seeded random ones, which cost the same, and its rows say so. Errors
+    are those on a smaller pair against the package in float64.
+    """
+    from contextlib import nullcontext
+
+    from ihbench.metrics import lpips
+
+    rows = []
+    frame, small = person_case(size, size), person_case(LPIPS_ERROR_SIZE, LPIPS_ERROR_SIZE)
+    for net in nets or lpips.NETS:
+        lacking = lpips.lacking(net)
+        with lpips.random_networks() if lacking else nullcontext():
+            network = lpips.load(net)
+            if isinstance(network, str):
+                raise BadInput(network)
+            steps = _lpips_steps(network, net, tile=max(LPIPS_TILE, size // 2 // LPIPS_TILE * LPIPS_TILE))
+            checks = _lpips_steps(network, net, tile=LPIPS_TILE)
+            timings = interleave({k: partial(_timed, f, frame) for k, f in steps.items()}, min(repeats, 3), warm_up=1)
+            truths = _lpips_in_double(network, small)
+            named = f"{net}, random trunk" if lacking else net
+            for name in steps:
+                region = "a person's crop" if "crop" in name else "whole frame"
+                error = abs(checks[name](small.pred, small.truth) - truths["crop" in name])
+                memory = peak_mib(lambda f=steps[name]: f(frame.pred, frame.truth))
+                rows.append(_row("lpips", f"{named}, {region}@{size}", name, timings[name], memory, error))
+    return rows
+
+
+def _lpips_steps(network: Network, net: str, tile: int) -> dict[str, Metric]:
+    """Ways to the same number, and to that of a crop; `body` is the figure's region in a frame of any size."""
     from ihbench.metrics import lpips
     from ihbench.metrics.check import package_distance
 
-    rows = []
-    frame = person_case(size, size)
-    with lpips.random_networks() as networks:
-        for net, network in networks.items():
-            package = partial(package_distance, network.package, "[-1,1]")
-            ours = partial(lpips.lpips, net=net)
-            truth = package(frame.pred, frame.truth)
-            steps: dict[str, Metric] = {"ours": ours, "lpips package": package}
-            timings = interleave({k: partial(_timed, f, frame) for k, f in steps.items()}, min(repeats, 5), warm_up=1)
-            for name, metric in steps.items():
-                error = abs(metric(frame.pred, frame.truth) - truth)
-                memory = peak_mib(lambda f=metric: f(frame.pred, frame.truth))
-                rows.append(_row("lpips", f"{net}@{size}", name, timings[name], memory, error))
-    return rows
+    return {
+        "ours f32": partial(lpips.lpips, net=net),
+        f"ours f32, {TILED}": lambda x, y: network.distance(x, y, "[-1,1]", tile),
+        "lpips package f32": partial(package_distance, network.package, "[-1,1]"),
+        "ours f32, crop": lambda x, y: lpips.lpips(x, y, _body(x), net=net),
+        "lpips package f32, crop": lambda x, y: package_distance(network.package, "[-1,1]", *_painted(x, y)),
+    }
+
+
+def _lpips_in_double(network: Network, small: Case) -> tuple[float, float]:
+    """What the package says in float64 of the whole frame and of the crop."""
+    import torch
+
+    from ihbench.metrics.lpips import padded
+
+    found = []
+    package = network.package.double()
+    try:
+        for pair in ((small.pred, small.truth), _painted(small.pred, small.truth)):
+            x, y = (2 * _channels_first(padded(image)).double() - 1 for image in pair)
+            with torch.no_grad():
+                found.append(float(package(x, y)))
+    finally:
+        network.package.float()
+    return found[0], found[1]
+
+
+def _body(image: NDArray) -> NDArray[np.bool_]:
+    return person_case(*image.shape[:2]).regions["body"]
+
+
+def _painted(x: NDArray, y: NDArray) -> tuple[NDArray, NDArray]:
+    """Both images cut to the figure and white around it, as LPIPS of a region is defined."""
+    from ihbench.metrics.images import bounds
+
+    mask = _body(x)
+    rectangle = bounds(mask)
+    assert rectangle is not None
+    inside = mask[rectangle][..., None]
+    return np.where(inside, x[rectangle], np.float32(1)), np.where(inside, y[rectangle], np.float32(1))
 
 
 def frame_rows(repeats: int, size: int = SIZE) -> list[Row]:
@@ -151,7 +212,7 @@ def _compared(
     repeats: int,
 ) -> list[Row]:
     frames = {dtype: make(size, size, dtype) for dtype in {dtype for dtype, _, _ in steps.values()}}
-    with single_threaded_libraries(), _one_torch_thread():
+    with single_threaded_libraries(), one_torch_thread():
         timings = interleave({k: partial(_timed, f, frames[t]) for k, (t, f, _) in steps.items()}, repeats)
         rows = []
         for name, (dtype, metric, which) in steps.items():
@@ -160,18 +221,6 @@ def _compared(
             memory = peak_mib(lambda f=metric, x=frame: f(x.pred, x.truth))
             rows.append(_row(kernel, f"{case}@{size}", name, timings[name], memory, error))
     return rows
-
-
-@contextmanager
-def _one_torch_thread() -> Iterator[None]:
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _timed(metric: Callable[[NDArray, NDArray], Any], frame: Case) -> tuple[float, None]:

@@ -1,18 +1,23 @@
 """Work-precision of the bench's own kernels: milliseconds and error against the slow twin, for every back end.
 
-Behind `ihbench kernels`. A kernel is an entry of `KERNELS`: a function from the number of repetitions to table rows.
+Behind `ihbench kernels`. A kernel is an entry of `KERNELS`, or one that a method registers under `ihbench.kernels`: a
+function from the number of repetitions to table rows.
 """
 
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
-from ihbench import machine
+from ihbench import machine, registry
 from ihbench.errors import BadInput
 from ihbench.kernels.measuring import UNSTABLE, Row
 from ihbench.kernels.metrics import flip_rows, frame_rows, lpips_rows, ssim_rows
+from ihbench.kernels.position_maps import position_map_rows
 from ihbench.kernels.scoring import score_rows
+from ihbench.kernels.skinning import lbs_rows
 from ihbench.kernels.splats import WINDOW, splat_rows
 from ihbench.kernels.zbuffers import zbuffer_rows
 
@@ -20,22 +25,28 @@ REPEATS = 15
 TABLE_WIDTH = 118  # characters; a narrower terminal would cut the numbers
 
 
-def run_kernels(names: Sequence[str] | None = None, as_json: bool = False, repeats: int = REPEATS) -> list[Row]:
+def run_kernels(
+    names: Sequence[str] | None = None, as_json: bool = False, repeats: int = REPEATS, figure: Path | None = None
+) -> list[Row]:
     """Measure the kernels called `names` (all of them by default) and print the result; returns its rows.
 
     Prints a table, or with `as_json` one JSON object {"machine": …, "rows": […]}. A row has kernel, case, backend,
     the median and the interquartile range of the timings in ms (None where the kernel has no backward pass), the
     memory the work needs beside its input in MiB, the errors against the twin, `unstable`, and `ratio`, its forward
-    time over that of the first back end of its case.
+    time over that of the first back end of its case. With `figure`, the work-precision diagram and its numbers are
+    written into that folder.
 
-    Raises BadInput for an unknown name or fewer than one repetition.
+    Raises BadInput for an unknown name, fewer than one repetition, or a folder that cannot be written.
     """
-    unknown = sorted(set(names or ()) - set(KERNELS))
+    known = [*KERNELS, *(name for name in registry.names("kernel") if name not in KERNELS)]
+    unknown = sorted(set(names or ()) - set(known))
     if unknown:
-        raise BadInput(f"kernel {unknown[0]!r}: expected one of {', '.join(sorted(KERNELS))}")
+        raise BadInput(f"kernel {unknown[0]!r}: expected one of {', '.join(sorted(known))}")
     if repeats < 1:
         raise BadInput(f"kernel repetitions: expected at least 1, got {repeats}")
-    rows = [row for name in (names or KERNELS) for row in KERNELS[name](repeats)]
+    rows = []
+    for name in names or known:
+        rows += (KERNELS[name] if name in KERNELS else registry.load("kernel", name))(repeats)
     first: dict[tuple[str, str], float] = {}
     for row in rows:
         row["ratio"] = row["forward_ms"] / first.setdefault((row["kernel"], row["case"]), row["forward_ms"])
@@ -44,6 +55,11 @@ def run_kernels(names: Sequence[str] | None = None, as_json: bool = False, repea
         print(json.dumps({"machine": about, "rows": rows}))
     else:
         _print_table(about, rows)
+    if figure is not None:
+        from ihbench.kernels.figure import draw
+
+        drawn = draw(rows, about, figure)
+        print(f"diagram: {drawn}, with the same name .svg and .csv", file=sys.stderr)
     return rows
 
 
@@ -53,6 +69,8 @@ KERNELS: dict[str, Callable[[int], list[Row]]] = {
     "ssim": ssim_rows,
     "flip": flip_rows,
     "lpips": lpips_rows,
+    "lbs": lbs_rows,
+    "position-map": position_map_rows,
     "frame": frame_rows,
     "score": score_rows,
 }
@@ -82,13 +100,21 @@ def _print_table(about: Row, rows: list[Row]) -> None:
     console.print(table)
     gpu = f", {about['gpu']}" if about["gpu"] else ""
     console.print(f"{about['cpu']}, {about['torch_threads']} threads{gpu}, load average {about['load_average']}")
+    if busy(about):
+        console.print(f"Other work is running here (load above {machine.BUSY} per core): these times are unstable.")
     console.print(
         f"Median ± half the interquartile range; unstable: the range exceeds {UNSTABLE:.0%} of the median; ratio: of"
         " the forward time to that of the case's first row. Errors of splats are against the float64 twin in a window"
         f" of {WINDOW}² px (image: largest; gradient: relative norm), those of the z-buffer its depth's, in m,"
-        " against numpy, those of metrics against the float64 oracle on a small frame (LPIPS: against its package,"
-        " random trunk)."
+        " against numpy, those of metrics against the float64 oracle on a small frame (LPIPS: against its package in"
+        " float64), those of skinning and position maps the largest distance in m from float64 numpy, those of the"
+        " sampler the rms over hidden pixels from many steps in float64."
     )
+
+
+def busy(about: Row) -> bool:
+    """Whether the load at the end says that other work was in the way."""
+    return bool(about["load_average"]) and about["load_average"][0] > machine.BUSY * about["cores_usable"]
 
 
 def _digits(ms: float) -> str:

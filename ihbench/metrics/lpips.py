@@ -103,8 +103,9 @@ class Network:
     net: str
     package: Any  # lpips.LPIPS, in evaluation mode
 
-    def distance(self, pred: NDArray, truth: NDArray, feed: str) -> float:
-        """LPIPS of two finite images [H, W, 3] in [0, 1], at least `MIN_SIDE` on each side."""
+    def distance(self, pred: NDArray, truth: NDArray, feed: str, tile: int = TILE) -> float:
+        """LPIPS of two finite images [H, W, 3] in [0, 1], at least `MIN_SIDE` on each side, in tiles of `tile` px (a
+        multiple of every stride)."""
         import torch
 
         height, width = pred.shape[:2]
@@ -112,10 +113,10 @@ class Network:
         totals = [0.0] * len(STRIDES[self.net])
         counts = [0] * len(totals)
         with torch.no_grad():
-            for top in range(0, height, TILE):
-                for left in range(0, width, TILE):
-                    rows, row_core = _tile(top, height)
-                    columns, column_core = _tile(left, width)
+            for top in range(0, height, tile):
+                for left in range(0, width, tile):
+                    rows, row_core = _tile(top, height, tile)
+                    columns, column_core = _tile(left, width, tile)
                     images = [
                         torch.from_numpy(np.ascontiguousarray(image[rows, columns].transpose(2, 0, 1), np.float32))
                         for image in (pred, truth)
@@ -138,10 +139,10 @@ class Network:
             yield self.package.lins[layer]((unit[:1] - unit[1:]).square())[0, 0]
 
 
-def _tile(start: int, length: int) -> tuple[slice, tuple[int, int | None]]:
+def _tile(start: int, length: int, tile: int) -> tuple[slice, tuple[int, int | None]]:
     """Pixels to read for the tile from `start`, and its core within them; None is the end of the image."""
-    first, last = max(start - HALO, 0), min(start + TILE + HALO, length)
-    end = None if start + TILE >= length else start + TILE - first
+    first, last = max(start - HALO, 0), min(start + tile + HALO, length)
+    end = None if start + tile >= length else start + tile - first
     return slice(first, last), (start - first, end)
 
 

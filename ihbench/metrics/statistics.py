@@ -71,6 +71,32 @@ def mean_interval(per_subject: Mapping[str, float | Sequence[float]], level: flo
     return Interval(value, min(low, value), max(high, value), level, n, f"{method} over {n} subjects")
 
 
+def median_interval(per_subject: Mapping[str, float], level: float = 0.95) -> Interval:
+    """The median over subjects and the interval between two order statistics that holds the true one.
+
+    For values of which some may be infinite, such as seconds to a quality that is never reached: nothing is assumed
+    of their distribution. The interval is the narrowest symmetric pair of order statistics that covers at least
+    `level`; fewer than 6 subjects have none at 95 %, so it is their range, and the result's `level` is what that
+    covers (75 % for three). One subject has none. Raises `ValueError` for no subjects, NaN, and a level outside 0..1.
+    """
+    from scipy import stats
+
+    if not 0 < level < 1:
+        raise ValueError(f"interval: expected a level between 0 and 1, got {level}")
+    if not per_subject:
+        raise ValueError("interval: expected at least one subject")
+    values = np.sort(np.array([per_subject[subject] for subject in sorted(per_subject)], np.float64))
+    if np.isnan(values).any():
+        raise ValueError("interval: expected numbers, got NaN; leave absent ones out")
+    n = len(values)
+    middle = float((values[(n - 1) // 2] + values[n // 2]) / 2) if n % 2 == 0 else float(values[n // 2])
+    if n == 1:
+        return Interval(middle, math.nan, math.nan, level, n, "one subject has no interval")
+    covered = [1 - 2 * float(stats.binom.cdf(k, n, 0.5)) for k in range((n + 1) // 2)]  # dropping k at each end
+    k = max((k for k, share in enumerate(covered) if share >= level), default=0)
+    return Interval(middle, float(values[k]), float(values[n - 1 - k]), covered[k], n, f"order statistics of {n}")
+
+
 def interval_ends(
     means: NDArray[np.float64],  # [..., n] subjects' means
     level: float = 0.95,

@@ -127,7 +127,7 @@ class GaussianAvatar(nn.Module):
         if self.residual_on and position_map is not None:
             feature = feature + embedding_bag(
                 self.residual_index[points],
-                self.encoder(position_map),
+                self.encoder(position_map).to(self.residual_weight.dtype),  # half precision under autocast
                 per_sample_weights=self.residual_weight[points],
                 mode="sum",
             )

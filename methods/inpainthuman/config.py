@@ -18,6 +18,13 @@ from ihbench.plan import Omission, SceneMeasure
 STATIC_DEG = 5.0  # below this joint motion nothing depends on the pose
 NOTHING_HIDDEN = 0.002  # share of the texels that no frame shows although one faces them; fewer are specks
 FINEST_LEVEL = 3.0  # a level whose texels are this many times finer than the pixels cannot be told apart by them
+POINTS_A_PIXEL = 2.0  # along a side; more Gaussians than that draw the same picture
+LEAST_TEXELS = 64
+
+# shares of a step's time, measured at the quick profile
+RESIDUAL_SHARE = 0.13
+LEVEL_SHARE = 0.07  # of each level
+POINTS_SHARE = 0.87  # of what grows with the number of Gaussians
 
 
 @dataclass(frozen=True)
@@ -125,13 +132,15 @@ PAPER = InpaintHumanConfig(
 
 PROFILES = {"quick": QUICK, "paper": PAPER}
 
+SHARED_STATES = {"stage1": ("inpaint.", "refine.")}  # saved state -> beginnings of the fields it does not depend on
+
 
 def leave_out(config: InpaintHumanConfig, scene: SceneMeasure) -> list[Omission]:
     """What this scene does not need of this configuration (see `ihbench.plan`)."""
     found = []
     if config.pose_residual and scene.motion_deg < STATIC_DEG:
         reason = f"no joint turns more than {scene.motion_deg:.1f}° over the training frames (limit {STATIC_DEG}°)"
-        found.append(Omission("pose_residual", False, reason))
+        found.append(Omission("pose_residual", False, reason, _both_fits(RESIDUAL_SHARE)))
     useful = tuple(r for r in config.levels if scene.texel_mm(r) * FINEST_LEVEL >= scene.pixel_mm)
     useful = useful or (min(config.levels),)
     if useful != config.levels:
@@ -139,13 +148,28 @@ def leave_out(config: InpaintHumanConfig, scene: SceneMeasure) -> list[Omission]
             f"a pixel covers {scene.pixel_mm:.1f} mm of the body; levels {config.levels} go down to "
             f"{scene.texel_mm(max(config.levels)):.1f} mm"
         )
-        found.append(Omission("levels", useful, reason))
+        found.append(Omission("levels", useful, reason, _both_fits(LEVEL_SHARE * (len(config.levels) - len(useful)))))
+    texels = config.texels
+    while texels > LEAST_TEXELS and scene.texel_mm(texels // 2) * POINTS_A_PIXEL <= scene.pixel_mm:
+        texels //= 2
+    if texels != config.texels:
+        reason = (
+            f"a pixel covers {scene.pixel_mm:.1f} mm of the body; {config.texels}² Gaussians stand "
+            f"{scene.texel_mm(config.texels):.1f} mm apart"
+        )
+        share = POINTS_SHARE * (1 - (texels / config.texels) ** 2)
+        found.append(Omission("texels", texels, reason, _both_fits(share)))
     inpaint = config.inpaint
     everything_seen = scene.hidden_texels <= NOTHING_HIDDEN
     if inpaint.on and everything_seen and inpaint.context == "seen" and not inpaint.turntable:
         reason = f"of the surface {scene.hidden_texels:.1%} is hidden whenever it faces the camera: nothing to paint"
-        found.append(Omission("inpaint.on", False, reason))
+        found.append(Omission("inpaint.on", False, reason, {"fit/stage2": 1.0, "fit/stage3": 1.0}))
     return found
+
+
+def _both_fits(share: float) -> dict[str, float]:
+    """A share of the seconds of both stages that optimise the avatar."""
+    return {"fit/stage1": share, "fit/stage3": share}
 
 
 def config_from(words: dict[str, Any]) -> InpaintHumanConfig:

@@ -1,9 +1,17 @@
-"""What stages 1 and 3 share: AdamW on the avatar, step by step, stopped after any step and gone on with later."""
+"""What stages 1 and 3 share: AdamW on the avatar, step by step, stopped after any step and gone on with later.
+
+The guard has three parts. Gradients are clipped. A step whose loss or gradient is not finite, or whose loss has
+exploded, is rejected: the fit goes back to the last good state and on with smaller step sizes, a bounded number of
+times, and the ledger has an event of each. What that cannot mend is a divergence, recorded with its first bad step.
+"""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,6 +22,19 @@ from ihbench.ledger import Ledger
 from ihbench.methods.inpainthuman.avatar import GaussianAvatar
 from ihbench.progress import Progress
 from ihbench.scene import MaskState, TrainingSet
+
+GOOD_EVERY = 25  # steps between two copies to go back to
+SMALLER = 0.1  # share that is left of the step sizes after going back
+MOST_ROLL_BACKS = 3  # of a stage
+EXPLODED = 10.0  # times what any view cost at first, and what this one costs with the last good parameters
+
+
+@dataclass(frozen=True)
+class _Good:
+    """A state whose loss and gradients were finite; `step` are done."""
+
+    step: int
+    tensors: dict[str, Tensor]
 
 
 class Optimisation(ABC):
@@ -55,6 +76,10 @@ class Optimisation(ABC):
         self.optimizer = torch.optim.AdamW(groups, fused=True)
         self.names = {id(p): name for name, p in avatar.named_parameters()}
         self.step = 0
+        self.rolled_back = 0  # times
+        self._good: _Good | None = None
+        self._first_bad: Diverged | None = None
+        self._usual: float | None = None  # a loss of this size is nothing to wonder at
 
     @abstractmethod
     def _loss(self, k: int) -> Tensor:
@@ -69,14 +94,26 @@ class Optimisation(ABC):
     def run(self, progress: Progress) -> None:
         """Optimise to the last step, resuming a saved state if the ledger has one.
 
-        Raises `Diverged` at the first non-finite loss or gradient, `BadInput` when no view shows the person.
+        Raises `Diverged` with the first bad step where going back does not help: at the first step of all, for a view
+        whose own values are bad, and after `MOST_ROLL_BACKS`. `BadInput` when no view shows the person.
         """
         self._require_visible_pixels()
         self._restore()
+        started_at = self.step
         with progress.task(self.title, self.steps) as task:
             task.advance(self.step)
-            while self.step < self.steps:
-                self._one_step(self._view_of(self.step, self.views))
+            while True:
+                try:
+                    if self.step == self.steps:
+                        if self.step > started_at:
+                            self._check_end()
+                        break
+                    self._one_step(self._view_of(self.step, self.views))
+                except Diverged as bad:
+                    reached = self.step
+                    self._roll_back(bad)
+                    task.advance(self.step - reached)
+                    continue
                 self.step += 1
                 task.advance()
                 self.ledger.offer(self.first_step + self.step, self.avatar)
@@ -104,41 +141,127 @@ class Optimisation(ABC):
         rise = min((self.step + 1) / max(self.warm_up * self.steps, 1), 1)
         decay = config.lr_final + (1 - config.lr_final) * 0.5 * (1 + math.cos(math.pi * share))
         for group, rate in zip(self.optimizer.param_groups, self.rates, strict=True):
-            group["lr"] = rate * decay * rise
+            group["lr"] = rate * decay * rise * SMALLER**self.rolled_back
         self.optimizer.zero_grad(set_to_none=True)
         loss = self._loss(k)
-        if not math.isfinite(loss.item()):
-            raise Diverged(self.first_step + self.step, f"loss is {loss.item()}")
+        self._check_loss(k, loss.item())
         loss.backward()
         for group in self.optimizer.param_groups:
             norm = torch.nn.utils.clip_grad_norm_(group["params"], config.clip_gradient)
             if not math.isfinite(norm.item()):
                 raise Diverged(self.first_step + self.step, f"gradient norm is {norm.item()}")
+        if self.step % GOOD_EVERY == 0:
+            self._good = _Good(self.step, {name: value.detach().clone() for name, value in self._tensors().items()})
         self.optimizer.step()
 
-    def save(self) -> None:
-        """Hand parameters, optimiser moments and the step to the ledger."""
+    # --- the guard ---
+
+    def _check_loss(self, k: int, value: float) -> None:
+        """Raise `Diverged` unless the loss of view k is finite and has not exploded.
+
+        A view that shows little of the person may cost many times what others do, so a loss only counts as exploded
+        when the same view costs far less with the last good parameters. Once no going back is left, any finite loss
+        is taken: it may still come down.
+        """
+        step = self.first_step + self.step
+        if not math.isfinite(value):
+            raise Diverged(step, f"loss is {value}")
+        if self._usual is None:
+            self._usual = value
+        if value <= EXPLODED * self._usual or self._good is None or self.rolled_back == MOST_ROLL_BACKS:
+            return
+        before = self._loss_before(k, self._good)
+        if value > EXPLODED * before:
+            good = self.first_step + self._good.step
+            raise Diverged(step, f"loss is {value:.3g}, it was {before:.3g} with the parameters of step {good}")
+        self._usual = max(self._usual, before)
+
+    @torch.no_grad()
+    def _check_end(self) -> None:
+        """Raise `Diverged` when the last step, after which no loss is taken, has spoiled the avatar."""
+        if not all(p.isfinite().all() for p in self.avatar.parameters()):
+            raise Diverged(self.first_step + self.step, "a parameter is not finite")
+        k = self._view_of(self.step, self.views)
+        self._check_loss(k, self._loss(k).item())
+
+    @torch.no_grad()
+    def _loss_before(self, k: int, good: _Good) -> float:
+        """The loss of view k with the last good parameters; nothing else is touched."""
+        now = {name: p.data for name, p in self.avatar.named_parameters()}
+        try:
+            for name, p in self.avatar.named_parameters():
+                p.data = good.tensors[f"avatar.{name}"]  # not copied into: the graph of a loss may wait for its turn
+            return self._loss(k).item()
+        finally:
+            for name, p in self.avatar.named_parameters():
+                p.data = now[name]
+
+    def _roll_back(self, bad: Diverged) -> None:
+        """Go back to the last good state, with smaller step sizes. Raises `Diverged` where that cannot help."""
+        self._first_bad = self._first_bad or bad
+        good = self._good
+        if good is None or good.step == self.step:
+            raise bad
+        if self.rolled_back == MOST_ROLL_BACKS:
+            why = f"{self._first_bad.reason}; {self.rolled_back} times back with smaller step sizes did not help"
+            raise Diverged(self._first_bad.step, why) from bad
+        if not math.isfinite(self._loss_before(self._view_of(self.step, self.views), good)):
+            step = self.first_step + good.step
+            raise Diverged(bad.step, f"{bad.reason}, with the parameters of step {step} as well") from bad
+        self._put(good.tensors)
+        self.step = good.step
+        self._restored()
+        self.rolled_back += 1
+        step, share = self.first_step + good.step, SMALLER**self.rolled_back
+        what = f"{bad.reason} at step {bad.step}; went back to step {step}, step sizes × {share:g} from there"
+        self.ledger.event("rolled_back", stage=self.name, step=step, bad_step=bad.step, what=what)
+
+    # --- resume ---
+
+    def _tensors(self) -> dict[str, Tensor]:
+        """Parameters and optimiser moments by name; not copies."""
         tensors = {f"avatar.{name}": p.detach() for name, p in self.avatar.named_parameters()}
         for p, state in self.optimizer.state.items():
             for key, value in state.items():
                 tensors[f"adam.{self.names[id(p)]}.{key}"] = value
-        self.ledger.save_state(self.name, tensors, {"step": self.step})
+        return tensors
+
+    @torch.no_grad()
+    def _put(self, tensors: Mapping[str, Any]) -> None:
+        """Set parameters and moments to copies of these."""
+        self.optimizer.state.clear()
+        for name, p in self.avatar.named_parameters():
+            p.copy_(torch.as_tensor(tensors[f"avatar.{name}"]))
+            state = {
+                key: torch.as_tensor(tensors[f"adam.{name}.{key}"]).to(p.device, copy=True)
+                for key in ("step", "exp_avg", "exp_avg_sq")
+                if f"adam.{name}.{key}" in tensors
+            }
+            if state:
+                self.optimizer.state[p] = state
+
+    def save(self) -> None:
+        """Hand parameters, optimiser moments, the state to go back to and the step to the ledger."""
+        tensors, first = self._tensors(), self._first_bad
+        meta: dict[str, Any] = {"step": self.step, "rolled_back": self.rolled_back, "usual": self._usual}
+        meta["first_bad"] = None if first is None else [first.step, first.reason]
+        if self._good is not None and self.step < self.steps:
+            meta["good"] = self._good.step
+            tensors |= {f"good.{name}": value for name, value in self._good.tensors.items()}
+        self.ledger.save_state(self.name, tensors, meta)
 
     def _restore(self) -> None:
         saved = self.ledger.load_state(self.name)
         if saved is None:
             return
         tensors, meta = saved
-        with torch.no_grad():
-            for name, p in self.avatar.named_parameters():
-                p.copy_(torch.as_tensor(tensors[f"avatar.{name}"]))
-                state = {
-                    key: torch.as_tensor(tensors[f"adam.{name}.{key}"]).to(p.device, copy=True)
-                    for key in ("step", "exp_avg", "exp_avg_sq")
-                    if f"adam.{name}.{key}" in tensors
-                }
-                if state:
-                    self.optimizer.state[p] = state
+        self._put(tensors)
         self.step = int(meta["step"])
+        self.rolled_back, self._usual = meta.get("rolled_back", 0), meta.get("usual")
+        if meta.get("first_bad"):
+            self._first_bad = Diverged(*meta["first_bad"])
+        if "good" in meta:
+            named = {name.removeprefix("good."): v for name, v in tensors.items() if name.startswith("good.")}
+            self._good = _Good(meta["good"], {name: torch.as_tensor(v) for name, v in named.items()})
         self._restored()
         self.ledger.event("resumed", stage=self.name, step=self.step)

@@ -42,9 +42,12 @@ def prepare_target(avatar: GaussianAvatar, view: TrainView) -> Target:
     rows, cols = slice(y0, y0 + height), slice(x0, x0 + width)
     device = avatar.device
     mask = torch.from_numpy(np.ascontiguousarray(view.mask[rows, cols])).to(device)[..., None]
+    image = view.image[rows, cols].astype(np.float32) / 255
+    unknown = (view.mask[rows, cols] == MaskState.UNKNOWN)[..., None]
+    image = np.where(unknown & ~np.isfinite(image), 0, image)  # a NaN there would pass through a weight of 0
     return Target(
         camera=camera,
-        image=torch.from_numpy(view.image[rows, cols].astype(np.float32) / 255).to(device),
+        image=torch.from_numpy(image).to(device),
         person=(mask == MaskState.PERSON).float(),
         background=(mask == MaskState.BACKGROUND).float(),
         points=torch.from_numpy(avatar.unhidden(camera, view.body_pose)).to(device),

@@ -63,3 +63,13 @@ def test_wrong_shapes_and_values_are_refused_by_name(change, word):
     good = {"K": np.eye(3), "R": np.eye(3), "t": np.zeros(3), "width": 4, "height": 4}
     with pytest.raises(ValueError, match=word):
         Camera(**{**good, **change})
+
+
+@pytest.mark.parametrize(
+    ("eye", "target"), [((0, 3, 0), (0, 0, 0)), ((1, 2, 3), (1, 2, 3)), ((0, -1e9, 0), (0, 0, 0))]
+)
+def test_a_view_along_its_own_up_is_refused_and_not_nan(eye, target):
+    with pytest.raises(ValueError, match="look_at: expected a view direction that is not along up"):
+        look_at(np.array(eye, float), np.array(target, float))
+    R, _ = look_at(np.array([1e-6, 3.0, 0.0]), np.zeros(3))
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)

@@ -42,9 +42,11 @@ def test_plan_says_what_a_run_would_measure_and_leave_out(bench_with_run, finish
     assert told["scenes"]["standin-1"]["measure"] == about["measure"]
     assert told["expected_seconds_per_scene"] == about["total_seconds"]
     assert "5 training views (4 occluded), 4 test views" in plain.out
-    (omission,) = told["scenes"]["standin-1"]["left_out"]
-    assert omission["field"] == "levels"
-    assert f"left out: levels -> ({omission['value'][0]},): {omission['reason']}" in plain.out
+    levels, texels = told["scenes"]["standin-1"]["left_out"]
+    assert (levels["field"], texels["field"]) == ("levels", "texels")
+    assert f"left out: levels -> ({levels['value'][0]},): {levels['reason']}" in plain.out
+    assert f"left out: texels -> {texels['value']}: {texels['reason']} (saves about" in plain.out
+    assert "--keep FIELD" in plain.out
     assert (plain.status, plain.err) == (0, "")
     assert contents(bench_with_run.runs / finished.folder.name) == contents(finished.folder)
 
@@ -101,7 +103,8 @@ def test_runs_under_other_occlusion_stand_in_another_table(bench, mannequin):
         "## zju_occ@1, quick profile",
         "## zju_occ@1+occlusion=none, quick profile",
     }
-    assert all(part.count("| mannequin |") == 3 for part in (first, second))  # PSNR, SSIM, FLIP
+    for part in (first, second):
+        assert part.split("### Error against run time")[0].count("| mannequin |") == 3  # PSNR, SSIM, FLIP
 
 
 def test_a_report_can_name_its_runs_and_its_file(bench_with_run, mannequin, tmp_path):
@@ -129,6 +132,25 @@ def test_a_report_can_be_narrowed_to_what_matches(bench_with_run, mannequin):
     assert "no run folders under" in outcome.err
 
 
+def test_a_report_has_three_formats_and_draws_its_figures(bench_with_run, tmp_path):
+    figures, out = tmp_path / "figures", tmp_path / "report.tex"
+    words = ("report", "--runs", bench_with_run.runs, "--target", "psnr=5", "flip/hidden=0.9")
+    assert bench_with_run(*words, "--format", "tex", "--out", out, "--figures", figures).status == 0
+    names = {file.name for file in figures.iterdir()}
+    assert names == {f"{kind}_zju_occ@1_quick.{end}" for kind in ("work-precision", "quality-time")
+                     for end in ("png", "svg", "csv")}  # fmt: skip
+    assert r"\detokenize{figures/work-precision_zju_occ@1_quick.png}" in out.read_text()
+    page = bench_with_run(*words, "--format", "html").out
+    assert page.startswith("<!DOCTYPE html>")
+    assert page.count("data:image/png") == 2
+    table = bench_with_run(*words, "--figures", figures).out
+    assert "| method | PSNR ≥ 5 dB | FLIP hidden ≤ 0.9 |" in table
+    assert "work-precision_zju_occ@1_quick.png>)" in table
+    refused = bench_with_run("report", "--runs", bench_with_run.runs, "--target", "speed=3")
+    assert refused.status == 2
+    assert "--target speed=3: expected METRIC=NUMBER" in refused.err
+
+
 def test_a_damaged_run_does_not_take_the_others_with_it(bench_with_run, finished):
     damaged = bench_with_run.runs / "damaged"
     for name, spoil in {
@@ -141,7 +163,7 @@ def test_a_damaged_run_does_not_take_the_others_with_it(bench_with_run, finished
         spoil(folder)
     outcome = bench_with_run("report", "--runs", bench_with_run.runs)
     assert outcome.status == 0
-    assert outcome.out.count("| inpainthuman") == 3  # PSNR, SSIM, FLIP
+    assert outcome.out.split("### Error against run time")[0].count("| inpainthuman") == 3  # PSNR, SSIM, FLIP
     assert table_row(outcome.out, "inpainthuman")["scenes"] == "1"
     lines = outcome.err.splitlines()
     assert [line.startswith("ihbench: left out: ") for line in lines] == [True] * 3

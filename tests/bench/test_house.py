@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 CONTENT = ("methods", "datasets", "protocols", "reports")
-HEAVY = ("torch", "cv2", "kornia", "lpips", "diffusers", "transformers", "skimage")
+HEAVY = ("torch", "cv2", "kornia", "lpips", "diffusers", "transformers", "skimage", "matplotlib")
 
 
 def imports(path):

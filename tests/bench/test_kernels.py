@@ -1,12 +1,16 @@
 """The benchmark behind `ihbench kernels`: its rows, its scene, its statistics. No test looks at a clock."""
 
+import csv
 import json
+import math
 
 import numpy as np
 import pytest
 
+from ihbench import diagram
+from ihbench.body import load_body, position_map, texel_table
 from ihbench.errors import BadInput
-from ihbench.kernels import metrics, scoring, splats, table, zbuffers
+from ihbench.kernels import figure, metrics, position_maps, scoring, skinning, splats, table, zbuffers
 from ihbench.kernels.measuring import interleave, peak_mib, summary
 from ihbench.render.splat import render_gaussians
 
@@ -49,7 +53,9 @@ def test_json_is_one_object(small, capsys):
 
 
 def test_bad_input():
-    with pytest.raises(BadInput, match="kernel 'splatt': expected one of flip, frame, lpips, score"):
+    with pytest.raises(
+        BadInput, match="kernel 'splatt': expected one of flip, frame, lbs, lpips, position-map, samp"
+    ):
         table.run_kernels(["splatt"])
     with pytest.raises(BadInput, match="at least 1, got 0"):
         table.run_kernels(repeats=0)
@@ -103,10 +109,104 @@ def test_metric_rows_hold_the_error_of_every_dtype_and_library(capsys, monkeypat
     assert 0 < errors["f32"] < 2e-5  # our loss in torch and, where installed, torchmetrics, kornia and flip-evaluator
 
 
-def test_lpips_rows_compare_with_the_package():
-    rows = metrics.lpips_rows(1, size=64)
-    assert [r["backend"] for r in rows] == ["ours", "lpips package"] * 3
-    assert all(r["value_error"] < 1e-6 for r in rows)
+def test_lpips_whole_tiled_and_cropped_is_the_packages_up_to_single_precision(monkeypatch):
+    monkeypatch.setattr(metrics, "LPIPS_ERROR_SIZE", 192)
+    rows = metrics.lpips_rows(1, size=64, nets=["alex"])
+    assert [r["backend"] for r in rows] == [
+        "ours f32", "ours f32, tiled", "lpips package f32", "ours f32, crop", "lpips package f32, crop"
+    ]  # fmt: skip
+    assert all("random trunk" in r["case"] for r in rows)  # the tests' machine has no weights, and it is said
+    assert all(0 <= r["value_error"] < 1e-6 for r in rows)
+    assert any(r["value_error"] > 0 for r in rows)
+
+
+def test_too_small_a_halo_would_show_in_the_tiled_row(monkeypatch):
+    monkeypatch.setattr("ihbench.metrics.lpips.HALO", 16)
+    monkeypatch.setattr(metrics, "LPIPS_ERROR_SIZE", 192)
+    (tiled,) = [r for r in metrics.lpips_rows(1, size=64, nets=["alex"]) if r["backend"].endswith("tiled")]
+    assert tiled["value_error"] > 1e-6
+
+
+def test_skinning_loses_digits_with_its_precision_and_only_then():
+    rows = {r["backend"]: r for r in skinning.lbs_rows(1, (("few", 16),))}
+    assert list(rows) == ["numpy f64", "torch f64", "torch f32", "torch f16"]
+    assert rows["torch f64"]["value_error"] < 1e-14
+    assert 1e-9 < rows["torch f32"]["value_error"] < 1e-5
+    assert 1e-4 < rows["torch f16"]["value_error"] < 0.05
+    assert 0 < rows["torch f32"]["gradient_error"] < 1e-5 < rows["torch f16"]["gradient_error"] < 0.05
+    assert rows["numpy f64"]["backward_ms"] is None
+
+
+def test_position_maps_are_held_against_a_twin_that_asks_every_face(monkeypatch):
+    rows = position_maps.position_map_rows(1, (12,))
+    errors = {r["backend"]: r["value_error"] for r in rows}
+    assert errors["table anew f64"] < 1e-12
+    assert 0 < errors["cached table f32"] < 1e-6
+    monkeypatch.setattr("ihbench.body.position_map", lambda v, body, r: position_map(v[::-1], body, r))
+    wrong = {r["backend"]: r["value_error"] for r in position_maps.position_map_rows(1, (12,))}
+    assert wrong["cached table f32"] > 0.1
+
+
+def test_the_twin_of_a_coarser_look_is_the_finer_one_at_every_nth_texel():
+    body = load_body()
+    fine, inside = position_maps.brute_force_map(body.v_template, body, 12)
+    coarse, some = position_maps.brute_force_map(body.v_template, body, 12, step=3)
+    assert (fine[::3, ::3] == coarse).all()
+    assert (inside[::3, ::3] == some).all()
+    assert inside.sum() == len(texel_table(body, 12).index)
+
+
+def a_row(**changes):
+    row = {"kernel": "k", "case": "c", "backend": "b", "forward_ms": 1.0, "forward_iqr_ms": 0.1, "unstable": False,
+           "value_error": 1e-6, "ratio": 1.0}  # fmt: skip
+    return row | changes
+
+
+def test_the_diagram_shows_every_row_with_an_error_and_the_csv_has_all(tmp_path):
+    rows = [
+        a_row(),
+        a_row(backend="exact", forward_ms=90.0, value_error=0.0),
+        a_row(kernel="wrong", value_error=math.inf),
+        a_row(kernel="untimed", value_error=None),
+        *(a_row(kernel="sampler", backend=f"{n} steps", forward_ms=float(n), knob="steps") for n in (1, 4)),
+    ]
+    about = {"cpu": "p", "torch_threads": 1, "gpu": None, "load_average": [0.1], "cores_usable": 2}
+    png = figure.draw(rows, about, tmp_path)
+    assert png.stat().st_size > 10_000
+    svg = png.with_suffix(".svg").read_text()
+    for shown in ("b", "exact", "1 steps", "4 steps", "sampler"):
+        assert f">{shown}<" in svg
+    assert ">wrong<" not in svg
+    assert ">untimed<" not in svg
+    found = list(csv.DictReader(png.with_suffix(".csv").open()))
+    assert [r["kernel"] for r in found] == [r["kernel"] for r in rows]
+    assert [float(r["value_error"] or "nan") for r in found[:3]] == [1e-6, 0.0, math.inf]
+    assert found[0]["machine"].startswith("p, 1 threads")
+
+
+def test_a_table_with_nothing_to_draw_is_still_written(tmp_path):
+    about = {"cpu": "p", "torch_threads": 1, "gpu": None, "load_average": None, "cores_usable": 2}
+    assert figure.draw([a_row(value_error=None)], about, tmp_path).exists()
+    assert diagram.round_ticks(1, 10)
+
+
+def test_a_kernel_that_a_method_registers_is_measured_beside_the_benchs_own(monkeypatch, capsys):
+    found = table.registry.names
+    monkeypatch.setattr(table.registry, "names", lambda kind: ["theirs"] if kind == "kernel" else found(kind))
+    monkeypatch.setattr(table.registry, "load", lambda kind, name: lambda repeats: [
+        a_row(kernel=name, backward_ms=None, backward_iqr_ms=None, peak_mib=None, gradient_error=None)
+    ])  # fmt: skip
+    (row,) = table.run_kernels(["theirs"], repeats=1)
+    assert row["kernel"] == "theirs"
+    assert "theirs" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("load", "said"), [(9.0, True), (0.5, False)])
+def test_a_busy_machine_is_named_below_the_table(small, capsys, monkeypatch, load, said):
+    identity = table.machine.identity() | {"load_average": [load, 0.0, 0.0], "cores_usable": 2}
+    monkeypatch.setattr(table.machine, "identity", lambda: identity)
+    table.run_kernels(["zbuffer"], repeats=1)
+    assert ("times are unstable" in capsys.readouterr().out) == said
 
 
 def test_scoring_is_timed_on_a_stand_in(bench, monkeypatch):

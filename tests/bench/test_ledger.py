@@ -126,6 +126,22 @@ def test_whatever_is_nested_in_whatever_the_books_balance(tree):
     assert math.isclose(ledger.seconds, clock.now - 100)
 
 
+def test_time_before_the_ledger_is_a_stage_of_its_own_and_the_books_still_balance():
+    clock = Clock()
+    ledger = Ledger(clock=clock)
+    with ledger.stage("fit"):
+        clock.sleep(2)
+        ledger.book("open", 5.0, 3.0)
+        clock.sleep(1)
+    assert seconds_of(ledger) == {"fit": 3, "open": 5, "other": 0, "total": 8}
+    assert ledger.fit_seconds == 3
+    assert_balanced(ledger)
+    Ledger(state=ledger.state(), clock=clock).book("open", 1.0)
+    for name, seconds in (("fit/x", 1.0), ("", 1.0), ("open", -1.0), ("open", math.nan)):
+        with pytest.raises(ValueError, match="stage"):
+            ledger.book(name, seconds)
+
+
 def test_a_pause_stops_the_fit_clock_and_is_booked_as_evaluation():
     clock = Clock()
     ledger = Ledger(clock=clock)

@@ -23,6 +23,19 @@ def test_identity_is_complete_and_fits_into_json():
     assert facts["torch"] == torch.__version__
 
 
+def test_the_load_of_the_beginning_is_kept_beside_that_of_the_end():
+    before = machine.identity() | {"load_average": [7.0, 7.0, 7.0], "torch": None, "gpu": None}
+    after = machine.identity_at_end(before)
+    assert after["load_average"] == [7.0, 7.0, 7.0]
+    assert after["load_average_end"] == machine.identity()["load_average"]
+    assert after["torch"] == torch.__version__
+
+
+def test_a_cpu_has_nothing_to_warm_up_and_torch_is_not_brought_for_it():
+    code = "import sys; from ihbench import machine; machine.warm_up('cpu'); assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_identity_does_not_import_torch():
     code = (
         "import sys; from ihbench import machine; facts = machine.identity(); machine.synchronize('cuda')\n"

@@ -204,3 +204,16 @@ def test_a_large_capture_opens_without_decoding_an_image(tmp_path, monkeypatch):
     assert (capture.n_frames, len(capture.camera_ids)) == (646, 23)
     assert capture.image_path(22, 645).name == "000645.jpg"
     assert read == []
+
+
+def test_another_image_size_is_the_same_protocol_but_for_its_images():
+    protocol = load_protocol("zju_occ")
+    small = protocol.with_size(64)
+    assert (small.image.size, small.name) == (64, f"{protocol.name}+size=64")
+    assert small.digest != protocol.digest
+    assert small.with_size(protocol.image.size).digest == protocol.digest
+    assert protocol.with_size(None) is protocol.with_size(protocol.image.size) is protocol
+    assert small.with_occlusion("none").name == f"{protocol.name}+size=64+occlusion=none"
+    for bad in (7, 8193):
+        with pytest.raises(BadInput, match="--image-size"):
+            protocol.with_size(bad)

@@ -10,8 +10,16 @@ from scipy.spatial.transform import Rotation
 from ihbench import plan
 from ihbench.body import texel_table
 from ihbench.config_fields import flat, with_fields
-from ihbench.methods.inpainthuman.config import PAPER, QUICK, leave_out
-from ihbench.plan import TEXELS, SceneMeasure, absent_regions, expected_seconds, measure_scene
+from ihbench.methods.inpainthuman.config import LEAST_TEXELS, PAPER, QUICK, RESIDUAL_SHARE, leave_out
+from ihbench.plan import (
+    TEXELS,
+    Omission,
+    SceneMeasure,
+    absent_regions,
+    expected_seconds,
+    measure_scene,
+    stage_seconds,
+)
 from ihbench.protocol import REGIONS
 from ihbench.scene import BodyPose
 from ihbench.views import open_scene
@@ -160,6 +168,17 @@ def test_levels_finer_than_the_pixels_are_left_out(moving, config, pixel_mm, lev
     assert all(f"{pixel_mm:.1f} mm" in o.reason for o in left_out)
 
 
+@pytest.mark.parametrize("config", [QUICK, PAPER], ids=["quick", "paper"])
+@pytest.mark.parametrize("pixel_mm", [1.0, 12.0, 24.0, 50.0, 5000.0])
+def test_no_more_gaussians_than_the_pixels_can_tell_apart(moving, config, pixel_mm):
+    scene = replace(moving, pixel_mm=pixel_mm)
+    left_out = [o.value for o in leave_out(config, scene) if o.field == "texels"]
+    texels = left_out[0] if left_out else config.texels
+    assert texels == LEAST_TEXELS or scene.texel_mm(texels // 2) > pixel_mm / 2  # half as many would be too few
+    assert texels == config.texels or scene.texel_mm(texels) <= pixel_mm / 2
+    assert bool(left_out) == (scene.texel_mm(config.texels // 2) <= pixel_mm / 2)
+
+
 def test_a_far_camera_makes_the_pixels_coarse():
     far = measured(FakeCapture([a_pose(k) for k in range(3)], [a_camera(distance=9.0, size=256)] * 4))
     near = measured(FakeCapture([a_pose(k) for k in range(3)], [a_camera(size=256)] * 4))
@@ -214,6 +233,7 @@ def a_run(seconds, method="inpainthuman", profile="quick", status="done"):
         "status": status,
         "identity": {"method": method, "profile": profile},
         "about": {"total_seconds": seconds},
+        "ledger": {"stages": {"fit/stage1": {"seconds": 0.5 * seconds}}} if isinstance(seconds, int) else {},
     }
 
 
@@ -229,6 +249,22 @@ def test_expected_seconds_are_the_median_of_finished_runs_alike(tmp_path):
     assert expected_seconds(tmp_path, "inpainthuman", "quick") == 30
     assert expected_seconds(tmp_path, "inpainthuman", "paper") == 5
     assert expected_seconds(tmp_path, "another", "quick") is None
+
+
+def test_what_an_omission_saves_is_its_share_of_the_stages_of_earlier_runs(tmp_path, moving):
+    for k, seconds in enumerate((10, 30, 100)):
+        (tmp_path / str(k)).mkdir()
+        record = a_run(seconds)
+        if k == 2:
+            record["ledger"]["stages"] |= {"fit/stage2": {"seconds": 40}, "fit/stage3": {"seconds": 20}}
+        (tmp_path / str(k) / "run.json").write_text(json.dumps(record))
+    stages = stage_seconds(tmp_path, "inpainthuman", "quick")
+    assert stages == {"fit/stage1": 15, "fit/stage2": 40, "fit/stage3": 20}
+    found = {o.field: o.seconds(stages) for o in leave_out(QUICK, replace(moving, motion_deg=0.0, hidden_texels=0.0))}
+    assert found["inpaint.on"] == 60
+    assert found["pose_residual"] == pytest.approx(RESIDUAL_SHARE * 35)
+    assert Omission("hidden", None, "why").seconds(stages) is None
+    assert Omission("x", 1, "why", {"fit/stage9": 1.0}).seconds(stages) is None
 
 
 def test_a_measure_can_be_made_by_hand():

@@ -173,13 +173,13 @@ def test_a_divergence_is_recorded_at_its_first_bad_step_and_stands(bench, monkey
 
     def spoiled(*arguments):
         calls.append(1)
-        return loss_of(*arguments) * (float("nan") if len(calls) == 5 else 1)
+        return loss_of(*arguments) * (float("nan") if len(calls) >= 5 else 1)
 
     monkeypatch.setattr(stage1, "loss_of", spoiled)
     assert_diverged(bench, bench.run(), 4)
-    before = contents(bench.folders()[0])
+    before, made = contents(bench.folders()[0]), len(calls)
     assert_diverged(bench, bench.run(), 4)
-    assert len(calls) == 5
+    assert len(calls) == made
     assert contents(bench.folders()[0]) == before
 
 

@@ -283,11 +283,11 @@ def test_a_capture_that_lacks_frames_or_cameras_is_refused(change, words):
     with pytest.raises(BadInput, match=words) as caught:
         open_scene(turning_capture(), replace(fake_protocol(), **change))
     assert "\n" not in str(caught.value)
-    assert "fake" in str(caught.value)
+    assert "drawn" in str(caught.value)
 
 
 def test_a_protocol_without_a_training_frame_is_refused():
-    with pytest.raises(BadInput, match="fake"):
+    with pytest.raises(BadInput, match="drawn"):
         open_scene(turning_capture(), replace(fake_protocol(rule="none"), train_frames=Span(10, "max_frames", 1)))
 
 

@@ -19,6 +19,7 @@ from ihbench.metrics.statistics import (
     holm,
     interval_ends,
     mean_interval,
+    median_interval,
     paired_test,
     smallest_detectable_difference,
 )
@@ -375,3 +376,36 @@ def test_what_has_no_detectable_difference_is_refused():
     for alpha, power in [(0.0, 0.8), (0.05, 1.0), (0.05, 0.05), (0.9, 0.8), (math.nan, 0.8)]:
         with pytest.raises(ValueError, match="0 < alpha < power < 1"):
             smallest_detectable_difference([1.0, 2.0], alpha, power)
+
+
+# ------------------------------------------------------------------------------------------------------- the median
+
+
+@pytest.mark.parametrize("n", [2, 3, 5, 6, 7, 9, 20])
+def test_the_interval_of_the_median_covers_what_it_says_and_no_narrower_pair_covers_enough(n):
+    rng = np.random.default_rng(n)
+    interval = median_interval({str(k): float(k) for k in range(n)})
+    low, high = int(interval.low), int(interval.high)
+    assert low + high == n - 1
+    samples = np.sort(rng.exponential(size=(40_000, n)), axis=1)
+    true = math.log(2)
+    covers = np.mean((samples[:, low] <= true) & (true <= samples[:, high]))
+    assert covers == pytest.approx(interval.level, abs=0.01)
+    assert interval.level >= 0.95 or (low, high) == (0, n - 1)
+    if low + 1 < high - 1:
+        assert np.mean((samples[:, low + 1] <= true) & (true <= samples[:, high - 1])) < 0.95 + 0.01
+
+
+def test_never_is_a_value_like_any_other():
+    some = median_interval({"a": 3.0, "b": math.inf, "c": 5.0})
+    assert (some.value, some.low, some.high) == (5.0, 3.0, math.inf)
+    assert median_interval({"a": 3.0, "b": math.inf}).value == math.inf
+    assert median_interval({"a": 3.0, "b": 5.0}).value == 4.0
+    alone = median_interval({"a": 3.0})
+    assert alone.value == 3.0
+    assert math.isnan(alone.low)
+    for bad in ({}, {"a": math.nan}):
+        with pytest.raises(ValueError, match="interval"):
+            median_interval(bad)
+    with pytest.raises(ValueError, match="level"):
+        median_interval({"a": 1.0}, level=1.0)

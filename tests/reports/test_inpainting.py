@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ihbench.reports.inpainting import inpainting_section, stage_lines
+from ihbench.reports.inpainting import inpainting_section
+from ihbench.reports.markdown import markdown
 from ihbench.results import RunResult
 
 
@@ -23,16 +24,10 @@ def run(*events, stages=None):
 
 def test_means_over_runs_and_only_the_last_event_of_a_resumed_one():
     runs = [run(event(99.0), event(4.0)), run(event(6.0, views=5))]
-    lines = inpainting_section({"ours": runs, "stage 1": [run()]})
+    lines = markdown(inpainting_section({"ours": runs, "stage 1": [run()]})).splitlines()
     rows = [line for line in lines if line.startswith("| ") and "method" not in line]
     assert rows == ["| ours | 2 | 4 of 10 | 100 | 5.0 (2.0) | absent | 0.040 (0.020) |"]
 
 
 def test_no_section_without_paintings():
     assert inpainting_section({"stage 1": [run()]}) == []
-
-
-def test_stages_are_told_of_runs_that_have_more_than_one():
-    stages = {"fit": 9.0, "fit/stage1": 5.0, "fit/stage2": 3.0, "fit/stage2/adapt": 2.0, "fit/stage3": 1.0}
-    assert stage_lines([run(stages=stages)]) == ["- fit of standin-1, seed 4: stage1 5 s, stage2 3 s, stage3 1 s"]
-    assert stage_lines([run(stages={"fit": 5.0, "fit/stage1": 5.0})]) == []

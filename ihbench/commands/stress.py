@@ -1,0 +1,42 @@
+"""`ihbench stress`: the stiff and extreme cases, case by case."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
+
+from ihbench.commands.parse import options
+
+
+@dataclass(frozen=True)
+class StressOptions:
+    group: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Groups to run: metrics, geometry, splat, data, training, ranking; none means all."""
+    case: tuple[str, ...] = ()
+    """Only the cases of these names."""
+    json: bool = False
+    """Print one JSON object on stdout."""
+
+
+def main(argv: list[str]) -> int:
+    chosen = options(
+        StressOptions, argv, "stress",
+        "Stiff and extreme cases with known answers; status 1 if one fails that is not listed as known.",
+    )  # fmt: skip
+    from ihbench.progress import Progress
+    from ihbench.stress.run import chosen_cases, run_cases
+    from ihbench.stress.table import as_json, failures, print_table
+
+    start, processor_start = time.perf_counter(), time.process_time()
+    cases = chosen_cases(chosen.group, chosen.case)
+    with Progress().task("stress", len(cases)) as task:
+        outcomes = run_cases(cases, lambda outcome: task.advance())
+    seconds = time.perf_counter() - start, time.process_time() - processor_start
+    if chosen.json:
+        print(as_json(outcomes, *seconds))
+    else:
+        print_table(outcomes, *seconds)
+    return 1 if failures(outcomes) else 0

@@ -1,0 +1,70 @@
+"""Saved states that one run takes from another: the rungs of an ablation often begin alike."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ihbench import atomic
+from ihbench.errors import BadInput
+from ihbench.store import RunFolder
+
+
+def lender(runs: Path, borrower: RunFolder, state: str, free: Sequence[str]) -> RunFolder | None:
+    """A finished run under `runs` that has `state`, and whose identity differs from the borrower's at most in
+    configuration fields whose names begin with one of `free`; None when there is none, or nothing is missing."""
+    if _file(borrower.path, state).is_file():
+        return None
+    wanted = _key(borrower, free)
+    for file in sorted(_file(folder, state) for folder in Path(runs).glob("*/") if folder != borrower.path):
+        if file.is_file():
+            try:
+                other = RunFolder.open(file.parent.parent)
+            except BadInput:
+                continue  # a damaged record vouches for nothing
+            if other.status == "done" and _key(other, free) == wanted:
+                return other
+    return None
+
+
+def lend(other: RunFolder, borrower: RunFolder, state: str) -> None:
+    """Copy the state, and the points of the quality-time curve up to it."""
+    target = _file(borrower.path, state)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    copy = target.with_name(f".{target.name}.tmp")
+    shutil.copyfile(_file(other.path, state), copy)
+    copy.replace(target)
+    last = _last_step(target)
+    points = [point for point in other.curve() if point["step"] <= last]
+    atomic.write_json_lines(borrower.path / "curve.jsonl", points)
+
+
+def _last_step(file: Path) -> int:
+    """The step that a saved state was taken at."""
+    from ihbench.ledger import saved_meta
+
+    return int(saved_meta(file)["step"])
+
+
+def _file(folder: Path, state: str) -> Path:
+    return folder / "checkpoints" / f"{state}.safetensors"
+
+
+def _key(run: RunFolder, free: Sequence[str]) -> dict[str, Any]:
+    identity = dict(run.identity)
+    identity["config"] = _without(identity["config"], free)
+    return identity
+
+
+def _without(config: dict[str, Any], free: Sequence[str], before: str = "") -> dict[str, Any]:
+    """A configuration as JSON has it, without the fields whose dotted names begin with one of `free`."""
+    out: dict[str, Any] = {}
+    for name, value in config.items():
+        path = f"{before}{name}"
+        if isinstance(value, dict):
+            out[name] = _without(value, free, f"{path}.")
+        elif not path.startswith(tuple(free)):
+            out[name] = value
+    return out

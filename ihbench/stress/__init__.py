@@ -1,0 +1,1 @@
+"""The stiff and extreme cases behind `ihbench stress`: named, versioned, each with an answer known otherwise."""

@@ -1,0 +1,74 @@
+"""Running cases one after the other."""
+
+from __future__ import annotations
+
+import math
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from importlib import import_module
+
+from ihbench import registry
+from ihbench.errors import BadInput
+from ihbench.stress.case import Case, Outcome, Verdict, error_of
+from ihbench.threads import one_torch_thread
+
+GROUPS = ("metrics", "geometry", "splat", "data", "training", "ranking")  # a module each, with a list CASES
+
+
+def all_cases() -> list[Case]:
+    """Every case, group by group: the bench's own, then those of registered methods."""
+    cases = [case for group in GROUPS for case in import_module(f"ihbench.stress.{group}").CASES]
+    for name in registry.names("stress cases"):
+        cases += registry.load("stress cases", name).CASES
+    return sorted(cases, key=lambda case: GROUPS.index(case.group) if case.group in GROUPS else len(GROUPS))
+
+
+def chosen_cases(groups: Sequence[str] = (), names: Sequence[str] = ()) -> list[Case]:
+    """The cases of these groups (of all, where none is named) that have one of these names (any, where none is).
+
+    Raises `BadInput` for a group or a name that does not exist.
+    """
+    cases = all_cases()
+    known = list(dict.fromkeys(case.group for case in cases))
+    for group in groups:
+        if group not in known:
+            raise BadInput(f"stress group {group!r}: {registry.nearest(group, known)}")
+    cases = [case for case in cases if not groups or case.group in groups]
+    for name in names:
+        if name not in (found := [case.name for case in cases]):
+            raise BadInput(f"stress case {name!r}: {registry.nearest(name, found)}")
+    return [case for case in cases if not names or case.name in names]
+
+
+def run_cases(cases: Sequence[Case], after_each: Callable[[Outcome], None] = lambda outcome: None) -> list[Outcome]:
+    """Run cases in order, on one torch thread."""
+    outcomes = []
+    with one_torch_thread():
+        for case in cases:
+            outcomes.append(run_case(case))
+            after_each(outcomes[-1])
+    return outcomes
+
+
+def run_case(case: Case) -> Outcome:
+    """Run one case. An exception or a numerical warning in it is a failure, not the end."""
+    start = time.perf_counter()
+    value, expected, error, condition, note = math.nan, math.nan, math.inf, None, ""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", RuntimeWarning)
+            answer = case.function()
+        error, value, expected = error_of(answer, case.unit)
+        condition, note = answer.condition, answer.note
+        reason = "" if error <= case.tolerance else f"error {error:.3g} beyond {case.tolerance:g} ({case.unit})"
+    except Exception as trouble:
+        first_line = next(iter(str(trouble).splitlines()), "")
+        reason = f"raised {type(trouble).__name__}: {first_line}"
+    verdict: Verdict = "passed"
+    if reason:
+        verdict, reason = ("known", f"{case.known} [{reason}]") if case.known else ("failed", reason)
+    elif case.known:
+        note = f"{note}; listed as known to fail, but passes" if note else "listed as known to fail, but passes"
+    seconds = time.perf_counter() - start
+    return Outcome(case, value, expected, error, condition, verdict, reason, note, seconds)

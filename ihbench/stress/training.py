@@ -1,0 +1,78 @@
+"""Stiff training: what is asked of any method, and how a case states what became of a fit.
+
+A method brings its own cases: a module with a list CASES, registered under `ihbench.stress`. This one has the cases
+that need none, of the pieces that every fit here is made of.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from ihbench.errors import Diverged
+from ihbench.ledger import Ledger
+from ihbench.stress.case import Answer, Case
+
+
+def told(fit: Callable[[], Any], ledger: Ledger) -> tuple[Any, str]:
+    """What a fit gave (None for a divergence), and its story in words: every rejected step and where it went back to,
+    or "no step rejected", and the first bad step of a divergence."""
+    try:
+        fitted, end = fit(), ""
+    except Diverged as outcome:
+        fitted, end = None, f"diverged, first bad step {outcome.step}: {outcome.reason}"
+    back = [_went_back(event["data"]) for event in ledger.events if event["kind"] == "rolled_back"]
+    story = "; ".join(back) if back else "" if end else "no step rejected"
+    return fitted, "; ".join(part for part in (story, end) if part)
+
+
+def _went_back(data: Mapping[str, Any]) -> str:
+    return f"step {data['bad_step']} rejected, back to {data['step']}" if "bad_step" in data else str(data["what"])
+
+
+def _pull(shift: float) -> float:
+    """Of the squared error of a black Gaussian `shift` m beside where it should be, along x."""
+    import torch
+
+    from ihbench.render.splat import render_gaussians
+    from ihbench.stress.splat import camera
+
+    view = camera(80, 20)
+    mean = torch.tensor([[shift, 0.0, 2.0]], requires_grad=True)
+    scale, color = torch.tensor([0.1]), torch.zeros(1, 3)
+    target = render_gaussians(torch.tensor([[0.0, 0.0, 2.0]]), scale, color, view)[0]
+    (render_gaussians(mean, scale, color, view)[0] - target).square().mean().backward()
+    assert mean.grad is not None
+    return float(mean.grad[0, 0])
+
+
+def _apart() -> Answer:
+    """A footprint ends where alpha is 1/255: beyond two of them no pixel pulls, and a fit from there is stuck."""
+    return Answer(_pull(0.9) / _pull(0.1), 0.0, math.inf)
+
+
+def _close() -> Answer:
+    """Gradient descent from half a footprint away arrives."""
+    import torch
+
+    from ihbench.render.splat import render_gaussians
+    from ihbench.stress.splat import camera
+
+    mean = torch.tensor([[0.1, 0.0, 2.0]], requires_grad=True)
+    scale, color = torch.tensor([0.1]), torch.zeros(1, 3)
+    target = render_gaussians(torch.tensor([[0.0, 0.0, 2.0]]), scale, color, camera())[0]
+    optimizer = torch.optim.Adam([mean], lr=0.01)
+    for _ in range(60):
+        optimizer.zero_grad()
+        (render_gaussians(mean, scale, color, camera())[0] - target).square().mean().backward()
+        optimizer.step()
+    return Answer(float(mean.detach()[0, 0]), 0.0)
+
+
+CASES = [
+    Case("descent-close", "training", "one Gaussian moved onto another, 2 px away", "absolute", 0.01,
+         "m; Adam's step size", _close),
+    Case("descent-apart", "training", "the pull between two Gaussians that do not touch", "absolute", 1e-2,
+         "relative to that of two that do; where pixels sample a footprint its sum is not quite constant", _apart),
+]  # fmt: skip

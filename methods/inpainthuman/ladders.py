@@ -1,0 +1,102 @@
+"""Ablations of InpaintHuman: the paper's Table 2 in both readings, and sweeps that the paper lacks."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ihbench.ablation import Comparison, Ladder, Rung
+
+ONE_LEVEL: dict[str, Any] = {"levels": (128,)}  # the paper does not say which single map its baseline has
+NO_PAINTER: dict[str, Any] = {"inpaint.on": False}
+NEITHER: dict[str, Any] = {"inpaint.ti": False, "inpaint.sg": False}
+
+
+def _paper(psnr: float, ssim: float, lpips: float) -> dict[str, float]:
+    return {"psnr": psnr, "ssim": ssim, "lpips": lpips}
+
+
+ROWS = (
+    _paper(20.05, 0.9501, 61.47),
+    _paper(22.35, 0.9603, 55.92),
+    _paper(24.27, 0.9649, 38.53),
+    _paper(24.31, 0.9701, 37.42),
+)
+
+
+def _levels(*sides: int) -> Rung:
+    return Rung("+".join(map(str, sides)), {"levels": sides, **NO_PAINTER})
+
+
+LADDERS = {
+    "table2": Ladder(
+        "the paper's Table 2, in both readings of its first two rows",
+        (
+            Rung("one level", ONE_LEVEL | NO_PAINTER, ROWS[0]),
+            Rung("MS", NO_PAINTER, ROWS[1]),
+            Rung("one level, diffusion", ONE_LEVEL | NEITHER, ROWS[0]),
+            Rung("MS, diffusion", NEITHER, ROWS[1]),
+            Rung("MS + TI", {"inpaint.sg": False}, ROWS[2]),
+            Rung("MS + TI + SG", {}, ROWS[3]),
+        ),
+        (
+            Comparison("multi-scale maps", "one level", "MS"),
+            Comparison("multi-scale maps, with diffusion", "one level, diffusion", "MS, diffusion"),
+            Comparison("diffusion without a word", "MS", "MS, diffusion"),
+            Comparison("the word V* (TI)", "MS, diffusion", "MS + TI"),
+            Comparison("diffusion and the word", "MS", "MS + TI"),
+            Comparison("semantic guidance (SG)", "MS + TI", "MS + TI + SG"),
+            Comparison("everything", "one level", "MS + TI + SG"),
+        ),
+        "The paper does not say whether diffusion is off in its first two rows or on without the word; the paper's "
+        "numbers stand beside both.",
+    ),
+    "plan": Ladder(
+        "everything, against what the plan leaves of it for each scene",
+        (Rung("everything", keep=("all",)), Rung("planned")),
+        (Comparison("leaving out what the scene does not need", "everything", "planned"),),
+    ),
+    "levels": Ladder(
+        "levels of the UV feature maps, stage 1 alone",
+        (_levels(64), _levels(64, 128), _levels(64, 128, 256), _levels(128), _levels(256)),
+        (
+            Comparison("a level of 128", "64", "64+128"),
+            Comparison("a level of 256", "64+128", "64+128+256"),
+            Comparison("three levels instead of 128", "128", "64+128+256"),
+            Comparison("three levels instead of 256", "256", "64+128+256"),
+        ),
+    ),
+    "fusion": Ladder(
+        "how levels are joined, stage 1 alone",
+        (Rung("sum", NO_PAINTER), Rung("concat", {"fusion": "concat", **NO_PAINTER})),
+        (Comparison("concatenation instead of the sum", "sum", "concat"),),
+    ),
+    "residual": Ladder(
+        "the pose-dependent residual, stage 1 alone",
+        (Rung("without", {"pose_residual": False, **NO_PAINTER}), Rung("with", NO_PAINTER)),
+        (Comparison("the pose residual", "without", "with"),),
+    ),
+    "rank": Ladder(
+        "rank of LoRA on the painter",
+        (
+            *(Rung(f"rank {r}", {"inpaint.tune": "lora", "inpaint.rank": r}) for r in (2, 8, 32)),
+            Rung("every weight", {"inpaint.tune": "all"}),
+        ),
+        (
+            Comparison("rank 8 instead of 2", "rank 2", "rank 8"),
+            Comparison("rank 32 instead of 8", "rank 8", "rank 32"),
+            Comparison("every weight instead of rank 8", "rank 8", "every weight"),
+        ),
+    ),
+    "painter": Ladder(
+        "what paints hidden surface",
+        (
+            Rung("nothing", NO_PAINTER),
+            *(Rung(name, {"inpaint.filler": name}) for name in ("push-pull", "mirror", "temporal")),
+            Rung("diffusion", {}),
+        ),
+        tuple(
+            Comparison(f"diffusion instead of {name}", name, "diffusion")
+            for name in ("nothing", "push-pull", "mirror", "temporal")
+        ),
+    ),
+}  # fmt: skip

@@ -1,0 +1,444 @@
+"""Stiff training of InpaintHuman: the smallest avatar, a person of six small frames, and everything that goes wrong.
+
+Registered under `ihbench.stress`. A case's note says which steps the guard rejected and where it went back to.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+
+from ihbench.camera import Camera
+from ihbench.errors import BadInput
+from ihbench.ledger import Ledger
+from ihbench.methods.inpainthuman.avatar import GaussianAvatar
+from ihbench.methods.inpainthuman.config import QUICK, InpaintHumanConfig
+from ihbench.methods.inpainthuman.method import InpaintHuman
+from ihbench.methods.inpainthuman.optimisation import MOST_ROLL_BACKS
+from ihbench.methods.inpainthuman.stage1 import Stage1, loss_of, prepare_target
+from ihbench.progress import Progress
+from ihbench.scene import MaskState, TrainingSet, TrainView
+from ihbench.stress.case import Answer, Case, Unit, words_of
+from ihbench.stress.drawn_capture import WHITE, a_camera, a_pose, the_body, train_view
+from ihbench.stress.training import told
+
+SIZE = 48  # px
+STEPS = 16
+RATES = ("lr_maps", "lr_decoder", "lr_encoder")
+# step sizes and a first scale at which 16 steps show something; at this size the rim is half of the person
+TINY = replace(
+    QUICK,
+    texels=48, levels=(16, 32), channels=8, decoder_width=32, position_map=16, residual_channels=4, steps=STEPS,
+    lr_maps=3e-2, lr_decoder=1e-2, background_weight=0.2, scale_initial=0.4,
+    inpaint=replace(QUICK.inpaint, on=False),
+)  # fmt: skip
+
+HELPS = "the loss over the views after the fit, over the loss before: a fit that does not lower it is worse than none"
+STEP = "a step is counted"
+REFUSED = "it must be refused, and the line must say this"
+EXACT = "not a bit may change"
+
+
+@cache
+def views() -> tuple[TrainView, ...]:
+    """Six sides of a person who bends; every other view has a strip."""
+    return tuple(
+        train_view(
+            a_camera(0.0, SIZE), a_pose(1.05 * k, 0.3 * math.sin(k)), slice(21, 27) if k % 2 else None, frame=k
+        )
+        for k in range(6)
+    )
+
+
+def training_set(chosen: Sequence[TrainView] | None = None) -> TrainingSet:
+    return TrainingSet(list(views() if chosen is None else chosen), the_body(), WHITE, "stress")
+
+
+def mean_loss(avatar: GaussianAvatar, training: TrainingSet) -> float:
+    import torch
+
+    with torch.no_grad():
+        losses = [loss_of(avatar, prepare_target(avatar, v), training.background).item() for v in training.views]
+    return float(np.mean(losses))
+
+
+def fresh(config: InpaintHumanConfig) -> GaussianAvatar:
+    return GaussianAvatar(config, the_body(), np.zeros(10), 0)
+
+
+def scaled_rates(factor: float, **changes: Any) -> InpaintHumanConfig:
+    return replace(TINY, **{name: factor * getattr(TINY, name) for name in RATES}, **changes)
+
+
+def fitted(
+    config: InpaintHumanConfig,
+    training: TrainingSet,
+    avatar: GaussianAvatar | None = None,
+    prepare: Callable[[Stage1], None] = lambda stage: None,
+) -> tuple[GaussianAvatar | None, str]:
+    """The avatar after stage 1, None where it diverged, and what happened on the way."""
+    ledger, avatar = Ledger(), avatar or fresh(config)
+    stage = Stage1(avatar, training, 0, ledger)
+    prepare(stage)
+
+    def fit() -> GaussianAvatar:
+        stage.run(Progress.silent())
+        return avatar
+
+    return told(fit, ledger)
+
+
+def _ratio(config: InpaintHumanConfig, training: TrainingSet, start: GaussianAvatar | None = None) -> Answer:
+    """Loss after over loss before."""
+    before = mean_loss(start or fresh(config), training)
+    after, story = fitted(config, training, start)
+    return Answer(math.nan if after is None else mean_loss(after, training) / before, 1.0, note=story)
+
+
+# ----------------------------------------------------------------------------------------------------
+# Step sizes
+
+
+def _rates(factor: float) -> Answer:
+    return _ratio(scaled_rates(factor), training_set())
+
+
+def _absurd_rates() -> Answer:
+    """1e30 times too large: nothing can be saved, and the record says so."""
+    after, story = fitted(scaled_rates(1e30), training_set())
+    assert after is None
+    return Answer(story, "diverged, first bad step 1: loss is nan")
+
+
+def _last_step() -> Answer:
+    """The last step of all spoils the avatar, and no loss follows it: it is looked at nevertheless."""
+
+    def spoil(stage: Stage1) -> None:
+        step, calls = stage.optimizer.step, []
+
+        def spoiled(*args: Any) -> Any:
+            calls.append(1)
+            step(*args)
+            if len(calls) == STEPS:
+                stage.avatar.features.table.data[:] = math.nan
+
+        stage.optimizer.step = spoiled
+
+    after, story = fitted(TINY, training_set(), prepare=spoil)
+    finite = after is not None and all(bool(p.isfinite().all()) for p in after.parameters())
+    return Answer(f"finite {finite}: {story}", f"finite True: step {STEPS} rejected, back to 0")
+
+
+def _clipped(factor: float) -> Answer:
+    """Loss and gradients scaled by a factor: Adam does not see it where clipping sees all of it, or nothing."""
+
+    def scale(stage: Stage1) -> None:
+        loss = stage._loss
+        stage._loss = lambda k: factor * loss(k)
+
+    config = replace(TINY, clip_gradient=1e30)
+    after, story = fitted(config, training_set(), prepare=scale)
+    before = mean_loss(fresh(config), training_set())
+    return Answer(math.nan if after is None else mean_loss(after, training_set()) / before, 1.0, note=story)
+
+
+# ----------------------------------------------------------------------------------------------------
+# Scales
+
+
+def _scales(raw: float) -> Answer:
+    """A fit from Gaussians whose scale factor is e^raw, against the loss that it began with."""
+    import torch
+
+    start = fresh(TINY)
+    with torch.no_grad():
+        start.decoder.linear[-1].bias[3] = raw
+    return _ratio(TINY, training_set(), start)
+
+
+def _dead_scales(raw: float) -> Answer:
+    """The gradient along the scales, where the decoder asks for a factor of e^raw, must not be 0."""
+    import torch
+
+    avatar = fresh(replace(TINY, scale_weight=0.0))
+    with torch.no_grad():
+        avatar.decoder.linear[-1].bias[3] = raw
+    loss_of(avatar, prepare_target(avatar, views()[0]), WHITE).backward()
+    bias: Any = avatar.decoder.linear[-1].bias
+    return Answer(float(bias.grad[3].abs() > 0), 1.0)
+
+
+def _bounded_scales() -> Answer:
+    """However large a factor the decoder asks for, no Gaussian is larger than the limit."""
+    import torch
+
+    found = []
+    for activation in ("exp", "softplus"):
+        avatar = fresh(replace(TINY, scale_activation=activation))
+        with torch.no_grad():
+            avatar.decoder.linear[-1].bias[3] = 1e30
+        found.append(float(avatar.decode(avatar.every_point, None)[1].detach().max()))
+    return Answer(found, TINY.scale_limit, precision=np.float32)
+
+
+# ----------------------------------------------------------------------------------------------------
+# What the views show
+
+
+def _contradiction() -> Answer:
+    """Every view once as it is, and once with person and background exchanged: there is no right answer, so the loss
+    cannot fall by much; it must not rise, nor end in NaN."""
+    swapped = []
+    for view in views():
+        mask = view.mask.copy()
+        mask[view.mask == MaskState.PERSON] = MaskState.BACKGROUND
+        mask[view.mask == MaskState.BACKGROUND] = MaskState.PERSON
+        swapped.append(replace(view, mask=mask))
+    return _ratio(TINY, training_set([*views(), *swapped]))
+
+
+def _wrong_pose() -> Answer:
+    """One frame in six has the pose of another."""
+    wrong = replace(views()[2], body_pose=views()[5].body_pose)
+    return _ratio(TINY, training_set([*views()[:2], wrong, *views()[3:]]))
+
+
+def _few(count: int) -> Answer:
+    return _ratio(TINY, training_set(views()[:count]))
+
+
+def _one_pixel() -> Answer:
+    """One visible pixel in all."""
+    mask = np.full_like(views()[0].mask, MaskState.UNKNOWN)
+    mask[tuple(np.argwhere(views()[0].mask == MaskState.PERSON)[9])] = MaskState.PERSON
+    return _ratio(TINY, training_set([replace(views()[0], mask=mask)]))
+
+
+def _speck() -> Answer:
+    """A view that shows one pixel of the person and all of the background costs a hundred times what others do; the
+    guard must not take it for an explosion."""
+    mask = np.full_like(views()[1].mask, MaskState.BACKGROUND)
+    mask[tuple(np.argwhere(views()[1].mask == MaskState.PERSON)[9])] = MaskState.PERSON
+    _, story = fitted(TINY, training_set([*views()[:4], replace(views()[1], mask=mask)]))
+    return Answer(story, "no step rejected")
+
+
+def _nothing(hidden: bool) -> Answer:
+    training = training_set(
+        [replace(v, mask=np.full_like(v.mask, MaskState.UNKNOWN)) for v in views()] if hidden else []
+    )
+
+    def fit() -> Any:
+        return InpaintHuman(TINY).fit(training, device="cpu", seed=0, ledger=Ledger(), progress=Progress.silent())
+
+    return Answer(words_of(BadInput, fit), "nothing to fit")
+
+
+def _behind() -> Answer:
+    """In one view the body is behind the camera."""
+    camera = views()[0].camera
+    behind = replace(views()[1], camera=Camera(camera.K, -camera.R, -camera.t, SIZE, SIZE))
+    training = training_set([views()[0], behind, *views()[2:]])
+    return _ratio(TINY, training)
+
+
+def _bad_pixel(bad: float) -> Answer:
+    """One pixel of one view is not finite. Its first step is known; smaller steps cannot help, so none is tried."""
+    image = views()[2].image.astype(np.float32)
+    image[tuple(np.argwhere(views()[2].mask == MaskState.PERSON)[9])] = bad
+    training = training_set([*views()[:2], replace(views()[2], image=image), *views()[3:]])
+    stage = Stage1(fresh(TINY), training, 0, Ledger())
+    first = next(step for step in range(6) if stage._view_of(step, 6) == 2)
+    after, story = fitted(TINY, training)
+    assert after is None
+    return Answer(story, f"diverged, first bad step {first}: loss is ")
+
+
+def _hidden_bad_pixel() -> Answer:
+    """A NaN behind the occluder is nobody's business: 0 × NaN must not enter the loss."""
+    image = views()[1].image.astype(np.float32)
+    image[views()[1].mask == MaskState.UNKNOWN] = math.nan
+    return _ratio(TINY, training_set([views()[0], replace(views()[1], image=image), *views()[2:]]))
+
+
+# ----------------------------------------------------------------------------------------------------
+# What happens on the way
+
+
+def _spoiled_once(how: str, at: int) -> Answer:
+    """A loss, or a gradient, is NaN once: the step is rejected, and the fit ends as well as any."""
+
+    def spoil(stage: Stage1) -> None:
+        loss, calls = stage._loss, []
+
+        def spoiled(k: int) -> Any:
+            calls.append(k)
+            value = loss(k)
+            if len(calls) - 1 != at:
+                return value
+            if how == "loss":
+                return value * math.nan
+            # sqrt(0) adds nothing to the loss, and 0 × inf = NaN to its gradient
+            return value + (value * 0).sqrt()
+
+        stage._loss = spoiled
+
+    before = mean_loss(fresh(TINY), training_set())
+    after, story = fitted(TINY, training_set(), prepare=spoil)
+    if f"step {at} rejected, back to 0" not in story:
+        raise AssertionError(f"expected step {at} rejected, got {story!r}")
+    return Answer(math.nan if after is None else mean_loss(after, training_set()) / before, 1.0, note=story)
+
+
+def _spoiled_for_good(at: int) -> Answer:
+    """From some step on every loss is NaN: a bounded number of ways back, then a divergence at that first step."""
+
+    def spoil(stage: Stage1) -> None:
+        loss, one_step = stage._loss, stage._one_step
+
+        def step(k: int) -> None:
+            stage._loss = lambda k: loss(k) * (math.nan if stage.step >= at else 1)
+            try:
+                one_step(k)
+            finally:
+                stage._loss = loss
+
+        stage._one_step = step
+
+    after, story = fitted(TINY, training_set(), prepare=spoil)
+    assert after is None
+    back = f"step {at} rejected, back to 0; " * MOST_ROLL_BACKS
+    return Answer(story, f"{back}diverged, first bad step {at}: loss is nan")
+
+
+def _bad_start() -> Answer:
+    """A feature is NaN before the first step."""
+    import torch
+
+    start = fresh(TINY)
+    with torch.no_grad():
+        start.features.table[start.features.index[100]] = math.nan
+    return Answer(fitted(TINY, training_set(), start)[1], "diverged, first bad step 0")
+
+
+def _resumed() -> Answer:
+    """Killed after a step was rejected, and gone on with from the state of step 11: the same bits as without."""
+
+    class SavesAt11(Ledger):
+        def due_to_save(self) -> bool:
+            return stage.step == 11
+
+    class Killed(Exception):
+        pass
+
+    config = scaled_rates(1000.0)
+    whole, _ = fitted(config, training_set())
+    ledger = SavesAt11()
+    stage = Stage1(fresh(config), training_set(), 0, ledger)
+    one_step = stage._one_step
+
+    def until_killed(k: int) -> None:
+        if stage.step == 14:
+            raise Killed
+        one_step(k)
+
+    stage._one_step = until_killed
+    with suppress(Killed):
+        stage.run(Progress.silent())
+    again = fresh(config)
+    Stage1(again, training_set(), 0, ledger).run(Progress.silent())
+    assert whole is not None
+    pairs = zip(whole.parameters(), again.parameters(), strict=True)
+    return Answer(sum(int((a != b).sum()) for a, b in pairs), 0)
+
+
+# ----------------------------------------------------------------------------------------------------
+# Half precision
+
+
+def _half_precision(name: str) -> Answer:
+    """The fit under autocast: matrix products in half precision, parameters and splats in float32."""
+    import torch
+
+    with torch.autocast("cpu", getattr(torch, name), cache_enabled=False):  # or the first weights would stay
+        return _ratio(TINY, training_set())
+
+
+def _half_colours() -> Answer:
+    """An avatar's pictures from parameters rounded to half precision: a grey level off at most, on average."""
+    import torch
+
+    avatar, _ = fitted(TINY, training_set())
+    assert avatar is not None
+    view = views()[0]
+    exact = avatar.render(view.camera, view.body_pose)[0]
+    with torch.no_grad():
+        for p in avatar.parameters():
+            p.copy_(p.half().float())
+    return Answer(float(np.abs(avatar.render(view.camera, view.body_pose)[0] - exact).mean()), 0.0)
+
+
+def _training(
+    name: str, what: str, unit: Unit, tolerance: float, why: str, function: Callable[[], Answer], known: str = ""
+) -> Case:
+    return Case(f"inpainthuman-{name}", "training", what, unit, tolerance, why, function, known)
+
+
+OUT_OF_REACH = (
+    "the scale factor is cut at e^±5 and the scale at its limit, and a cut has no gradient: such a Gaussian comes "
+    "back only through what its decoder shares with others; a fit does not get there by itself"
+)
+
+CASES = [
+    *(
+        _training(f"rate-{factor:g}", f"step sizes × {factor:g}", "at most", 0, HELPS, partial(_rates, factor))
+        for factor in (0.1, 1.0, 10.0, 100.0, 1000.0)
+    ),
+    _training("rate-1e30", "step sizes × 1e30", "words", 0, "the first step after the first update", _absurd_rates),
+    _training("last-step", "the last step of all gives NaN", "words", 0, STEP, _last_step),
+    *(
+        _training(f"loss-{factor:g}", f"loss × {factor:g}, no clipping", "at most", 0, HELPS,
+                  partial(_clipped, factor))
+        for factor in (1e-6, 1e12)
+    ),
+    _training("scale-collapse", "a fit from Gaussians e^-4 as large", "at most", 0, HELPS, partial(_scales, -4.0)),
+    _training("scale-explosion", "a fit from Gaussians at the limit of their scale", "at most", 0, HELPS,
+              partial(_scales, 4.0)),
+    _training("scale-collapse-gradient", "a scale factor of e^-4.9 has a gradient", "absolute", 0, EXACT,
+              partial(_dead_scales, -4.9)),
+    _training("scale-cut-gradient", "a scale factor of e^-6 has a gradient", "absolute", 0, EXACT,
+              partial(_dead_scales, -6.0), OUT_OF_REACH),
+    _training("scale-limit-gradient", "a scale beyond its limit has a gradient", "absolute", 0, EXACT,
+              partial(_dead_scales, 6.0), OUT_OF_REACH),
+    _training("scale-limit", "the largest scale a decoder can ask for", "ulp", 1, "the limit in float32",
+              _bounded_scales),
+    _training("contradiction", "every view with its mask and with the opposite", "at most", 0, HELPS, _contradiction),
+    _training("wrong-pose", "one frame has another's pose", "at most", 0, HELPS, _wrong_pose),
+    _training("one-frame", "one training frame", "at most", 0, HELPS, partial(_few, 1)),
+    _training("two-frames", "two training frames", "at most", 0, HELPS, partial(_few, 2)),
+    _training("one-pixel", "one visible pixel in all", "at most", 0, HELPS, _one_pixel),
+    _training("speck", "a view of one person pixel on known background", "words", 0, STEP, _speck),
+    _training("no-view", "no training view", "words", 0, REFUSED, partial(_nothing, False)),
+    _training("all-hidden", "views without a visible pixel", "words", 0, REFUSED, partial(_nothing, True)),
+    _training("behind-camera", "a view with the body behind the camera", "at most", 0, HELPS, _behind),
+    _training("nan-pixel", "a NaN among the person's pixels", "words", 0, STEP, partial(_bad_pixel, math.nan)),
+    _training("inf-pixel", "an infinite person pixel", "words", 0, STEP, partial(_bad_pixel, math.inf)),
+    _training("nan-hidden", "NaN behind the occluder", "at most", 0, HELPS, _hidden_bad_pixel),
+    _training("nan-loss-once", "the loss of step 9 is NaN", "at most", 0, HELPS, partial(_spoiled_once, "loss", 9)),
+    _training("nan-gradient-once", "a gradient of step 9 is NaN", "at most", 0, HELPS,
+              partial(_spoiled_once, "gradient", 9)),
+    _training("nan-loss-for-good", "every loss from step 9 on is NaN", "words", 0, STEP,
+              partial(_spoiled_for_good, 9)),
+    _training("nan-start", "a feature is NaN before the first step", "words", 0, STEP, _bad_start),
+    _training("resumed-after-rejection", "killed after a rejected step, and gone on with", "absolute", 0, EXACT,
+              _resumed),
+    _training("bfloat16", "matrix products in bfloat16", "at most", 0, HELPS, partial(_half_precision, "bfloat16")),
+    _training("float16-avatar", "pictures from parameters in float16", "absolute", 1 / 255,
+              "a grey level: 11 bits of a feature, through four layers", _half_colours),
+]  # fmt: skip

@@ -1,0 +1,222 @@
+"""The ablation table: every rung of a ladder, and what each component is worth in quality and in seconds.
+
+Seeds are averaged within a scene; the scene is the unit of intervals and tests.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ihbench.ablation import Comparison, Ladder
+from ihbench.cells import CellOutcome
+from ihbench.metrics import Identity
+from ihbench.metrics.identity import Metric, metric_of
+from ihbench.metrics.statistics import Interval, holm, mean_interval, paired_test
+from ihbench.reports.significance import ALPHA, LEVEL, per_scene
+from ihbench.results import RunResult
+
+REGIONS = ("visible", "hidden", "never_seen")  # beside the headline
+PAPER = {"psnr": ("PSNR", 2), "ssim": ("SSIM", 4), "lpips": ("LPIPS*", 2)}
+
+Found = list[tuple[str, CellOutcome]]  # rung and outcome of every run
+
+
+def write(ladder: Ladder, found: Found) -> tuple[str, dict[str, Any]]:
+    """Markdown, and the same numbers for programs (strict JSON). One table for each protocol."""
+    protocols: dict[str, Found] = {}
+    for rung, outcome in found:
+        protocols.setdefault(outcome.cell.request.protocol.name, []).append((rung, outcome))
+    lines = [f"## Ablation: {ladder.title}", ""]
+    tables = []
+    for protocol, cells in protocols.items():
+        text, numbers = _table(ladder, protocol, cells)
+        lines += [*text, ""]
+        tables.append(numbers)
+    if len(tables) > 1:
+        lines += [*_severities(ladder, tables), ""]
+    failures = [_failure(outcome) for _, outcome in found if not outcome.done]
+    if failures:
+        lines += ["Not done:", "", *(f"- {line}" for line in failures), ""]
+    if ladder.note:
+        lines += [ladder.note, ""]
+    return "\n".join(lines).rstrip() + "\n", {"ladder": ladder.title, "tables": tables, "failed": failures}
+
+
+def _table(ladder: Ladder, protocol: str, cells: Found) -> tuple[list[str], dict[str, Any]]:
+    runs: dict[str, list[RunResult]] = {rung.name: [] for rung in ladder.rungs}
+    for rung, outcome in cells:
+        if outcome.done and outcome.result is not None:
+            runs[rung].append(outcome.result)
+    done = [run for having in runs.values() for run in having]
+    request = cells[0][1].cell.request
+    lines = [f"### {protocol}, {request.method}, {request.protocol.profile} profile", ""]
+    if not done:
+        return [*lines, "No run was finished."], {"protocol": protocol, "rungs": {}, "comparisons": []}
+    headline = done[0].record["about"]["headline"]
+    columns = _columns(done, headline)
+    quoted = [m for m in PAPER if any(m in rung.paper for rung in ladder.rungs)]
+    titles = [f"{metric_of(i).title} {Identity.parse(i).region} {metric_of(i).arrow}" for i in columns]
+    titles += ["fit s"] + [f"paper's {PAPER[m][0]}" for m in quoted]
+    lines += [f"Data: {done[0].data}.", ""]
+    lines += ["| rung | scenes | runs | " + " | ".join(titles) + " |", "|---|---:|---:|" + "---:|" * len(titles)]
+    rungs: dict[str, Any] = {}
+    for rung in ladder.rungs:
+        having = runs[rung.name]
+        asked = sum(name == rung.name for name, _ in cells)
+        scores = {i: _interval(per_scene(having, i)) for i in columns}
+        seconds = _interval(_seconds(having))
+        cells_shown = [_shown(scores[i], metric_of(i)) for i in columns] + [_whole(seconds)]
+        cells_shown += [f"{rung.paper[m]:.{PAPER[m][1]}f}" if m in rung.paper else "" for m in quoted]
+        counted = f"{len(having)}" if len(having) == asked else f"{len(having)} of {asked}"
+        scenes = len({run.scene for run in having})
+        lines.append(f"| {rung.name} | {scenes} | {counted} | " + " | ".join(cells_shown) + " |")
+        rungs[rung.name] = {
+            "switches": {name: _plain(value) for name, value in rung.switches.items()},
+            "runs": len(having),
+            "asked": asked,
+            "scores": {i: _numbers(interval) for i, interval in scores.items()},
+            "fit_seconds": _numbers(seconds),
+            "paper": dict(rung.paper),
+        }
+    told, compared = _comparisons(ladder.comparisons, runs, columns)
+    if quoted:
+        lines += ["", "The paper's numbers are quoted: its own data, whole images, LPIPS* = 1000 × LPIPS."]
+    if told:
+        lines += ["", "What each component is worth (paired over scenes, mean over seeds):", "", *told]
+    return lines, {"protocol": protocol, "headline": headline, "rungs": rungs, "comparisons": compared}
+
+
+def _columns(runs: Sequence[RunResult], headline: str) -> list[str]:
+    """PSNR of the headline region and of what training showed of the surface, then the other metrics' headline."""
+    having = list(dict.fromkeys(i for run in runs for i, mean in run.rows[run.method].items() if not mean.absent))
+    found = [i for i in having if Identity.parse(i).region == headline]
+    first = [i for i in found if Identity.parse(i).metric == "psnr"]
+    surface = [
+        i for region in REGIONS for i in having
+        if Identity.parse(i).metric == "psnr" and Identity.parse(i).region == region and i not in first
+    ]  # fmt: skip
+    return [*first, *surface, *(i for i in found if i not in first)]
+
+
+def _comparisons(
+    wanted: Sequence[Comparison], runs: Mapping[str, Sequence[RunResult]], columns: Sequence[str]
+) -> tuple[list[str], list[dict[str, Any]]]:
+    """A table of differences, p adjusted over a column's comparisons; and the numbers."""
+    found: list[dict[str, Any]] = []
+    for comparison in wanted:
+        before, after = runs[comparison.without], runs[comparison.having]
+        row: dict[str, Any] = {"what": comparison.what, "without": comparison.without, "with": comparison.having}
+        row["scores"] = {i: _paired(per_scene(after, i), per_scene(before, i)) for i in columns}
+        row["fit_seconds"] = _paired(_seconds(after), _seconds(before))
+        found.append(row)
+    for i in columns:
+        tested = [row["scores"][i] for row in found if row["scores"][i] is not None]
+        for pair, p in zip(tested, holm([pair["p"] for pair in tested]), strict=True):
+            pair["p_adjusted"] = p
+    found = [row for row in found if any(row["scores"].values())]
+    if not found:
+        return [], []
+    titles = [f"{metric_of(i).title} {Identity.parse(i).region}" for i in columns]
+    lines = [
+        "| component | scenes | " + " | ".join(titles) + " | fit s |",
+        "|---|---:|" + "---:|" * (len(titles) + 1),
+    ]
+    for row in found:
+        n = max(pair["n"] for pair in row["scores"].values() if pair)
+        cells = [_difference(row["scores"][i], metric_of(i)) for i in columns]
+        seconds = row["fit_seconds"]
+        cells.append("" if seconds is None else f"{seconds['mean']:+.0f}")
+        lines.append(f"| {row['what']} | {n} | " + " | ".join(cells) + " |")
+    smallest = max((pair["smallest_p"] for row in found for pair in row["scores"].values() if pair), default=math.nan)
+    lines += ["", f"[{LEVEL:.0%} interval]; * better or worse with p < {ALPHA} (sign-flip test, Holm over the rows)."]
+    if smallest >= ALPHA:
+        lines.append(f"With so few scenes no p can be below {smallest:.2g}, so nothing can be marked.")
+    return lines, found
+
+
+def _paired(a: Mapping[str, float], b: Mapping[str, float]) -> dict[str, float | int | str] | None:
+    """The first minus the second over the scenes of both; None with fewer than two."""
+    common = sorted(set(a) & set(b))
+    if len(common) < 2:
+        return None
+    test = paired_test({s: a[s] for s in common}, {s: b[s] for s in common})
+    return {
+        "mean": test.interval.value, "low": test.interval.low, "high": test.interval.high,
+        "p": test.p, "smallest_p": test.smallest_p, "n": len(common),
+    }  # fmt: skip
+
+
+def _difference(pair: dict[str, Any] | None, metric: Metric) -> str:
+    if pair is None:
+        return "—"
+    mean, low, high = (pair[name] * metric.scale for name in ("mean", "low", "high"))
+    mark = "*" if pair["p_adjusted"] < ALPHA else ""
+    d = metric.decimals
+    return f"{mean:+.{d}f}{mark} [{low:+.{d}f}, {high:+.{d}f}]"
+
+
+def _severities(ladder: Ladder, tables: Sequence[Mapping[str, Any]]) -> list[str]:
+    """One line a rung, one column a protocol: the headline's first metric."""
+    having = [table for table in tables if table["rungs"]]
+    if not having:
+        return []
+    first = next(iter(next(iter(having[0]["rungs"].values()))["scores"]))
+    metric = metric_of(first)
+    lines = [f"### {metric.title} {Identity.parse(first).region} {metric.arrow} over protocols", ""]
+    lines.append("| rung | " + " | ".join(table["protocol"] for table in having) + " |")
+    lines.append("|---|" + "---:|" * len(having))
+    for rung in ladder.rungs:
+        scores = [table["rungs"].get(rung.name, {}).get("scores", {}).get(first) for table in having]
+        lines.append(
+            f"| {rung.name} | " + " | ".join("—" if s is None else metric.text(s["mean"]) for s in scores) + " |"
+        )
+    return lines
+
+
+def _seconds(runs: Sequence[RunResult]) -> dict[str, float]:
+    """Scene -> mean fit seconds."""
+    found: dict[str, list[float]] = {}
+    for run in runs:
+        seconds = run.record["about"].get("fit_seconds")
+        if seconds is not None:
+            found.setdefault(run.scene, []).append(float(seconds))
+    return {scene: math.fsum(values) / len(values) for scene, values in found.items()}
+
+
+def _interval(per: Mapping[str, float]) -> Interval | None:
+    return mean_interval(per, LEVEL) if per else None
+
+
+def _numbers(interval: Interval | None) -> dict[str, float | None] | None:
+    """For JSON, which knows no NaN."""
+    if interval is None:
+        return None
+    ends = {name: value if math.isfinite(value) else None for name, value in
+            (("low", interval.low), ("high", interval.high))}  # fmt: skip
+    return {"mean": interval.value, **ends, "n": interval.n}
+
+
+def _shown(interval: Interval | None, metric: Metric) -> str:
+    if interval is None:
+        return "—"
+    text = metric.text(interval.value)
+    if math.isfinite(interval.low):
+        half = (interval.high - interval.low) / 2 * metric.scale
+        text += f" ± {half:.{metric.decimals}f}"
+    return text
+
+
+def _whole(interval: Interval | None) -> str:
+    return "—" if interval is None else f"{interval.value:.0f}"
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _failure(outcome: CellOutcome) -> str:
+    if outcome.result is None:
+        return f"{outcome.cell.name}: {outcome.problem}"
+    return f"{outcome.cell.name}: {outcome.result.status} ({outcome.result.record['reason']})"

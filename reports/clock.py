@@ -1,0 +1,101 @@
+"""How far a report's seconds can be trusted: on which machine, beside what load, how far repeats lie apart."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Mapping, Sequence
+
+from ihbench.machine import BUSY
+from ihbench.reports.document import Words
+from ihbench.reports.labels import by_label
+from ihbench.results import RunResult
+
+UNSTABLE = 0.25  # repeats further apart than this share of their median are called unstable, as in `ihbench kernels`
+
+
+def by_machine(runs: Sequence[RunResult]) -> dict[str, list[RunResult]]:
+    """Runs by row label; where they were made on several machines, by label and machine (A, B, …).
+
+    Seconds of different machines are never averaged. Runs without a fit (scored predictions) have no seconds and are
+    left out.
+    """
+    timed = [run for run in runs if run.record["about"].get("fit_seconds") is not None]
+    letters = machine_letters(timed)
+    found: dict[str, list[RunResult]] = {}
+    for label, group in by_label(timed).items():
+        for run in group:
+            row = f"{label} on {letters[machine_name(run)]}" if len(letters) > 1 else label
+            found.setdefault(row, []).append(run)
+    return found
+
+
+def machine_letters(runs: Sequence[RunResult]) -> dict[str, str]:
+    """Machine -> A, B, … in the order given."""
+    names = dict.fromkeys(machine_name(run) for run in runs)
+    return {name: chr(ord("A") + k) if k < 26 else f"M{k}" for k, name in enumerate(names)}
+
+
+def machine_name(run: RunResult) -> str:
+    """Processor, cores and device of a run, in words."""
+    about = run.record.get("machine") or {}
+    words = [str(about.get("cpu") or "unknown processor"), f"{about.get('cores_usable') or '?'} cores"]
+    device = run.record["about"].get("device", "cpu")
+    if about.get("gpu"):
+        words.append(str(about["gpu"]))
+    elif device != "cpu":
+        words.append(f"{device}, GPU not recorded")
+    return ", ".join(words)
+
+
+def unstable(runs: Sequence[RunResult]) -> list[str]:
+    """Why the seconds of these runs (one row of a table) are unstable; nothing when they are not known to be."""
+    reasons = []
+    apart = max((_spread(group) for group in _by_scene(runs).values()), default=0.0)
+    if apart > UNSTABLE:
+        reasons.append(f"repeats {apart:.0%} of their median apart")
+    loads = [load for load in (_load_per_core(run) for run in runs) if load is not None]
+    if loads and max(loads) > BUSY:
+        busy = sum(load > BUSY for load in loads)
+        reasons.append(f"{busy} of {len(runs)} runs on a busy machine (load up to {max(loads):.1f} per core)")
+    return reasons
+
+
+def clock_notes(rows: Mapping[str, Sequence[RunResult]]) -> list[Words]:
+    """Machines, loads and what is unstable, as the items of a list."""
+    runs = [run for group in rows.values() for run in group]
+    letters = machine_letters(runs)
+    notes: list[Words] = []
+    for name, letter in letters.items():
+        here = [run for run in runs if machine_name(run) == name]
+        loads = [found for found in map(_load, here) if found is not None]
+        load = f"load average at the start {min(loads):.1f} to {max(loads):.1f}" if loads else "load unknown"
+        which = f"machine {letter}" if len(letters) > 1 else "machine"
+        notes.append(f"{which}: {name}; {load}")
+    told: dict[str, list[str]] = {}
+    for label, group in rows.items():
+        for reason in unstable(group):
+            told.setdefault(reason, []).append(label)
+    return [*notes, *(f"unstable seconds: {reason}: {'; '.join(labels)}" for reason, labels in told.items())]
+
+
+def _by_scene(runs: Sequence[RunResult]) -> dict[str, list[float]]:
+    found: dict[str, list[float]] = {}
+    for run in runs:
+        found.setdefault(run.scene, []).append(float(run.record["about"]["fit_seconds"]))
+    return found
+
+
+def _spread(seconds: Sequence[float]) -> float:
+    """How far repeats lie apart as a share of their median."""
+    middle = statistics.median(seconds)
+    return (max(seconds) - min(seconds)) / middle if len(seconds) > 1 and middle > 0 else 0.0
+
+
+def _load(run: RunResult) -> float | None:
+    loads = (run.record.get("machine") or {}).get("load_average")
+    return None if not loads else float(loads[0])
+
+
+def _load_per_core(run: RunResult) -> float | None:
+    load, cores = _load(run), (run.record.get("machine") or {}).get("cores_usable")
+    return None if load is None or not cores else load / cores

@@ -1,0 +1,236 @@
+"""What the general report says: per protocol, profile and kind of data the tables of methods and calibration rows,
+error against run time, what was painted, intervals and paired tests."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from ihbench.calibration import DESCRIPTIONS, ROWS
+from ihbench.metrics import Identity, Mean, macro_mean
+from ihbench.metrics.identity import metric_of
+from ihbench.quality_time import Target
+from ihbench.reports.document import (
+    Block,
+    Bullets,
+    Heading,
+    Paragraph,
+    Picture,
+    Table,
+    Words,
+    bullets,
+    code,
+    emphasis,
+    strong,
+)
+from ihbench.reports.inpainting import inpainting_section
+from ihbench.reports.labels import by_label
+from ihbench.reports.ledger_table import ledger_section
+from ihbench.reports.run_time import across_sizes_section, run_time_section
+from ihbench.reports.significance import intervals_section
+from ihbench.results import RunResult
+
+Rows = dict[str, dict[str, Mean]]  # of one run: row -> identity -> mean
+
+
+def general_report(
+    results: Sequence[RunResult],
+    presets: Sequence[str] = (),
+    targets: Sequence[Target] = (),
+    pictures: Sequence[tuple[Path, str]] = (),
+) -> list[Block]:
+    """All tables of these runs, and those of further metric presets that the runs were scored under.
+
+    Runs under different protocols, profiles or data never share a table, nor do presets. `targets` are qualities
+    whose times are asked for; `pictures` (file, caption) come at the end.
+    """
+    groups: dict[tuple[str, str, str, str], list[RunResult]] = {}
+    for result in results:
+        groups.setdefault(result.group, []).append(result)
+    blocks: list[Block] = []
+    for runs in groups.values():
+        blocks += _group(runs, presets, targets)
+    blocks += across_sizes_section(results)
+    if pictures:
+        blocks += [Heading(2, "Figures"), *(Picture(file, caption) for file, caption in pictures)]
+    return blocks
+
+
+def _group(runs: list[RunResult], presets: Sequence[str], targets: Sequence[Target]) -> list[Block]:
+    protocol, digest, profile, _ = runs[0].group
+    blocks: list[Block] = [
+        Heading(2, f"{protocol}, {profile} profile"),
+        Paragraph(("Data: ", *_data(runs[0]), ". Protocol digest ", code(digest), ".")),
+    ]
+    blocks += [
+        Paragraph(f"Not done: {run.method} on {run.scene}: {run.status} ({run.record['reason']}).")
+        for run in runs
+        if run.status != "done"
+    ]
+    done = [run for run in runs if run.status == "done"]
+    if not done:
+        return blocks
+    headline = done[0].record["about"]["headline"]
+    identities = list(dict.fromkeys(i for run in done for i in run.rows[run.method]))
+    for metric in dict.fromkeys(Identity.parse(i).metric for i in identities):
+        columns = [i for i in identities if Identity.parse(i).metric == metric and _has_a_number(done, i)]
+        if columns:
+            shown = metric_of(columns[0])
+            blocks.append(Heading(3, f"{shown.title} {shown.arrow}{f' ({shown.unit})' if shown.unit else ''}"))
+            first = metric == Identity.parse(identities[0]).metric
+            blocks.append(_table(done, [run.rows for run in done], columns, headline, with_costs=first))
+    blocks.append(
+        Paragraph(
+            f"Mean over test views of a scene, then over scenes ({_scenes(done)}). Headline region: {headline}."
+        )
+    )
+    blocks += _definitions(identities)
+    present = [row for row in ROWS if any(row in run.rows for run in done)]
+    blocks += bullets([*(f"{row}: {DESCRIPTIONS[row]}" for row in present), *_remarks(done)])
+    for preset in presets:
+        blocks += _preset(preset, done, headline)
+    labelled = by_label(done)
+    blocks += intervals_section(labelled, identities, headline)
+    blocks += run_time_section(done, identities, headline, targets)
+    blocks += ledger_section(done)
+    return blocks + inpainting_section(labelled)
+
+
+def _data(run: RunResult) -> tuple[Words, ...]:
+    about = run.record["about"]
+    if about["standin"]:
+        return strong(about["standin"]), ": made by the bench, not real data"
+    return (f"real data ({about['variant']})",)
+
+
+def _preset(name: str, runs: list[RunResult], headline: str) -> list[Block]:
+    """The table of one further preset, over the runs that were scored under it."""
+    having = [run for run in runs if name in run.presets]
+    blocks: list[Block] = [Heading(3, f"preset {name}")]
+    if not having:
+        return [*blocks, Paragraph(f"No run was scored under {name}: ihbench report --preset {name}")]
+    rows = [run.presets[name] for run in having]
+    identities = list(dict.fromkeys(i for run, found in zip(having, rows, strict=True) for i in found[run.method]))
+    columns = [
+        i for i in identities if any(i in found[row] and not found[row][i].absent for found in rows for row in found)
+    ]
+    if columns:
+        blocks.append(_table(having, rows, columns, headline, with_metric=True))
+    absent = {
+        f"absent: {metric_of(i).title} of {name}: {found[run.method][i].reason}"
+        for run, found in zip(having, rows, strict=True)
+        for i in identities
+        if i in found[run.method] and found[run.method][i].absent
+    }
+    return [*blocks, *_definitions(identities), Bullets(("scored from the runs' 8-bit renders", *sorted(absent)))]
+
+
+def _has_a_number(runs: list[RunResult], identity: str) -> bool:
+    """Whether any run has a method's number of this identity; `truth` and its like have them where methods do."""
+    return any(identity in run.rows[run.method] and not run.rows[run.method][identity].absent for run in runs)
+
+
+def _definitions(identities: Sequence[str]) -> list[Block]:
+    """The identity strings in the tables, with the region left open."""
+    names = dict.fromkeys(i.replace(f"/{Identity.parse(i).region}/", "/REGION/") for i in identities)
+    words: list[Words] = []
+    for name in names:
+        words += [" ", code(name)] if words else [code(name)]
+    return [Paragraph(tuple(words))] if words else []  # type: ignore[arg-type]
+
+
+def _table(
+    runs: list[RunResult],
+    rows_of: Sequence[Rows],  # of each run
+    columns: Sequence[str],
+    headline: str,
+    *,
+    with_costs: bool = False,
+    with_metric: bool = False,
+) -> Table:
+    parsed = [Identity.parse(i) for i in columns]
+    names = [i.region for i in parsed]
+    if with_metric:
+        names = [f"{metric_of(str(i)).title}{metric_of(str(i)).arrow} {i.region}" for i in parsed]
+    names = [  # regions of several presets in one table
+        f"{name} ({i.variant})" if names.count(name) > 1 else name for i, name in zip(parsed, names, strict=True)
+    ]
+    titles: list[Words] = [strong(t) if i.region == headline else t for i, t in zip(parsed, names, strict=True)]
+    costs = ["fit s", "total s", "peak MB"] if with_costs else []
+    head: list[Words] = ["method", "scenes", "seeds", *titles, *costs]
+    lines: list[tuple[Words, ...]] = []
+    where = {id(run): k for k, run in enumerate(runs)}
+    for label, group in by_label(runs).items():
+        chosen = [where[id(run)] for run in group]
+        cells = [
+            label,
+            str(len({r.scene for r in group})),
+            ", ".join(sorted({str(r.identity["seed"]) for r in group})),
+        ]
+        cells += [_cell([(runs[k].scene, rows_of[k][runs[k].method]) for k in chosen], i) for i in columns]
+        if with_costs:
+            cells += [_mean_of(group, "fit_seconds"), _mean_of(group, "total_seconds"), _largest(group, "peak_mb")]
+        lines.append(tuple(cells))
+        method = group[0].method
+        further = [row for k in chosen for row in rows_of[k] if row.startswith(f"{method} [")]
+        for row in dict.fromkeys(further):  # groups of test views that the protocol scores apart
+            having = [(runs[k].scene, rows_of[k][row]) for k in chosen if row in rows_of[k]]
+            name = label + row.removeprefix(method)
+            lines.append((name, cells[1], cells[2], *(_cell(having, i) for i in columns), *([""] * len(costs))))
+    for row in ROWS:
+        having = list(
+            {r.scene: (r.scene, rows[row]) for r, rows in zip(runs, rows_of, strict=True) if row in rows}.values()
+        )
+        if having:
+            numbers = [_cell(having, i) for i in columns]
+            lines.append((emphasis(row), str(len(having)), "", *numbers, *([""] * len(costs))))
+    return Table(tuple(head), tuple(lines), left=3)
+
+
+def _cell(per_run: list[tuple[str, dict[str, Mean]]], identity: str) -> str:
+    """Mean over seeds within a scene, then over scenes."""
+    by_scene: dict[str, dict[str, Mean]] = {}
+    for k, (scene, means) in enumerate(per_run):
+        if identity in means:
+            by_scene.setdefault(scene, {})[str(k)] = means[identity]
+    if not by_scene:
+        return "—"
+    return metric_of(identity).text(macro_mean({scene: macro_mean(runs) for scene, runs in by_scene.items()}).value)
+
+
+def _mean_of(runs: list[RunResult], key: str) -> str:
+    values = [run.record["about"][key] for run in runs]
+    known = [value for value in values if value is not None]
+    return f"{sum(known) / len(known):.0f}" if known else "—"
+
+
+def _largest(runs: list[RunResult], key: str) -> str:
+    return f"{max(run.record['about'][key] for run in runs):.0f}"
+
+
+def _scenes(runs: list[RunResult]) -> str:
+    return ", ".join(sorted({run.scene for run in runs}))
+
+
+def _remarks(runs: list[RunResult]) -> list[str]:
+    """Why cells of the methods' rows are empty, what their means do not run over, what the plan left out."""
+    absent: dict[tuple[str, str], list[str]] = {}
+    partly: dict[tuple[str, str, str], list[str]] = {}
+    notes: list[str] = []
+    for run in runs:
+        for identity, mean in run.rows[run.method].items():
+            metric, region = metric_of(identity).title, Identity.parse(identity).region
+            if mean.absent:
+                absent.setdefault((metric, mean.reason), []).append(region)
+            elif mean.note:
+                partly.setdefault((run.scene, region, mean.note), []).append(metric)
+        notes += [f"left out: {o['field']} → {o['value']}: {o['reason']}" for o in run.record["about"]["left_out"]]
+        notes += [
+            f"{run.method} on {run.scene}: {note}"
+            for note in run.record["about"].get("predictions", {}).get("notes", ())
+        ]
+    for (scene, region, note), metrics in partly.items():
+        notes.append(f"{region} of {scene} ({', '.join(dict.fromkeys(metrics))}): {note}")
+    for (metric, reason), regions in absent.items():
+        notes.append(f"absent: {metric}, {', '.join(dict.fromkeys(regions))}: {reason}")
+    return sorted(set(notes))

@@ -1,0 +1,333 @@
+"""The figures of the general report: work-precision diagrams (one point a configuration) and quality-time curves
+(checkpoints of the fits), each as PNG, SVG and the numbers as CSV."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from textwrap import fill
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ihbench import diagram
+from ihbench.metrics import Identity
+from ihbench.metrics.identity import METRICS
+from ihbench.metrics.statistics import interval_ends
+from ihbench.quality_time import QualityCurve, error_of, pareto_set
+from ihbench.reports.configurations import Configuration, configurations, short_value, sweeps
+from ihbench.reports.run_time import (
+    LEVEL,
+    WorkPoint,
+    curve_identities,
+    curves,
+    same_protocol,
+    seconds_interval,
+    shared_scenes,
+    work_points,
+)
+from ihbench.results import RunResult
+from ihbench.store import plain_name
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+PARTITION = ("visible", "hidden", "never_seen")  # regions whose curves are drawn beside the headline's
+AXES = {"psnr": "RMSE", "ssim": "1 − SSIM", "flip": "FLIP", "lpips": "LPIPS"}
+DRAWN = 3  # metrics at most, in one figure
+GRID = 40  # times at which a mean curve is drawn
+CROWD = 5  # configurations; of more, only the mean curves are drawn
+LEGEND_WIDTH = 88  # characters
+PROFILE_POINT = "all switches as the profile has them"
+
+
+def draw(results: Sequence[RunResult], folder: Path) -> list[tuple[Path, str]]:
+    """Draw all figures of these runs into a folder; gives each PNG with its caption.
+
+    Runs without a fit time or without numbers have no figure; none of them is no error.
+    """
+    drawn: list[tuple[Path, str]] = []
+    groups: dict[tuple[str, ...], list[RunResult]] = {}
+    for run in results:
+        if run.status == "done":
+            groups.setdefault(run.group, []).append(run)
+    names: set[str] = set()
+    for (protocol, digest, profile, data), runs in groups.items():
+        name = _new(f"{plain_name(protocol)}_{plain_name(profile)}", digest, names)
+        configs = configurations(runs)
+        headline = runs[0].record["about"]["headline"]
+        title = f"{protocol}, {profile} profile"
+        about = data.replace("*", "")
+        drawn += _work_precision(configs, headline, folder / f"work-precision_{name}", title, about)
+        drawn += _quality_time(configs, headline, folder / f"quality-time_{name}", title, about)
+    for (protocol, data), runs in same_protocol(results).items():
+        name = _new(f"{plain_name(protocol)}_profiles-and-sizes", "", names)
+        headline = runs[0].record["about"]["headline"]
+        about = f"{data.replace('*', '')}; test images differ in size: compare errors with care"
+        configs = configurations(runs, across=True)
+        title = f"{protocol}: profiles and image sizes"
+        drawn += _work_precision(configs, headline, folder / f"work-precision_{name}", title, about)
+    return drawn
+
+
+def _new(name: str, digest: str, taken: set[str]) -> str:
+    """A file name that no other group has."""
+    for candidate in (name, f"{name}_{digest[:6]}", *(f"{name}_{k}" for k in range(2, 1000))):
+        if candidate not in taken:
+            taken.add(candidate)
+            return candidate
+    raise AssertionError(name)
+
+
+# ---------------------------------------------------------------------------------------------------- work-precision
+
+
+def _work_precision(
+    configs: Sequence[Configuration], headline: str, path: Path, title: str, about: str
+) -> list[tuple[Path, str]]:
+    scenes = shared_scenes(configs)
+    found: dict[str, list[WorkPoint]] = {}
+    for i in dict.fromkeys(i for c in configs for run in c.runs for i in run.rows[run.method]):
+        parsed = Identity.parse(i)
+        if parsed.region != headline or parsed.metric not in METRICS or len(found) == DRAWN:
+            continue
+        points = [p for p in work_points(configs, i, scenes) if p.seconds.value > 0 and p.error.value > 0]
+        if points:
+            found[i] = points
+    if not found:
+        return []
+    drawn, axes = diagram.figure(len(found), width=5.0, height=5.2)
+    rows: list[dict[str, Any]] = []
+    handles: dict[str, Any] = {}
+    labels: list[tuple[Axes, list[diagram.Label], list[list[tuple[float, float]]]]] = []
+    for panel, (identity, points) in zip(axes, found.items(), strict=True):
+        front = pareto_set([p.seconds.value for p in points], [p.error.value for p in points])
+        diagram.logarithmic(
+            panel, [x for p in points for x in _ends(p.seconds)], [y for p in points for y in _ends(p.error)]
+        )
+        labels.append((panel, *_points(panel, points, handles)))
+        steps = [_at(points[k]) for k in front]
+        if len(steps) > 1:
+            (line,) = panel.plot(
+                *zip(*steps, strict=True), drawstyle="steps-post", color="#777777", ls="--", lw=1.1, zorder=1
+            )
+            handles.setdefault("Pareto set: nothing is as fast and better", line)
+        _name_axes(panel, identity, f"seconds of fitting, mean of {len(scenes)} scene{'s' * (len(scenes) > 1)}")
+        rows += [_csv_row(p, identity, k in front, scenes) for k, p in enumerate(points)]
+    _finish(drawn, handles, f"Work-precision: {title}", about)
+    for panel, beside, lines in labels:
+        diagram.place_labels(panel, beside, lines)
+    caption = (
+        f"Work-precision of {title} ({about}): error in region {headline} against seconds of fitting, both "
+        f"logarithmic; bars are {LEVEL:.0%} intervals over scenes, or over repeats of a single one."
+    )
+    return [(diagram.save(drawn, path, rows), caption)]
+
+
+def _points(
+    panel: Axes, points: Sequence[WorkPoint], handles: dict[str, Any]
+) -> tuple[list[diagram.Label], list[list[tuple[float, float]]]]:
+    """Draw the configurations, sweeps as lines; gives the texts that belong beside them, and the lines."""
+    place = {id(p.configuration): p for p in points}
+    labels: dict[int, diagram.Label] = {}
+    lines: list[list[tuple[float, float]]] = []
+    swept: set[int] = set()
+    style = iter(range(1000))
+    for sweep in sweeps([p.configuration for p in points]):
+        k = next(style)
+        colour, mark = diagram.COLOURS[k % len(diagram.COLOURS)], diagram.MARKS[k % len(diagram.MARKS)]
+        members = [(value, place[id(c)]) for value, c in sweep.members]
+        lines.append([_at(p) for _, p in members])
+        (line,) = panel.plot(*zip(*lines[-1], strict=True), color=colour, marker=mark, ms=6, lw=1.6, zorder=3)
+        default = [short_value(value) for value, p in members if sweep.axis not in p.configuration.changed]
+        handles.setdefault(f"{sweep.label}{f' (★ {default[0]})' if default else ''}", line)
+        for value, p in members:
+            _bars(panel, p, colour)
+            swept.add(id(p.configuration))
+            if sweep.axis in p.configuration.changed:
+                labels[id(p)] = diagram.Label(_at(p), short_value(value), colour)
+    for p in points:
+        c = p.configuration
+        if id(c) in swept and c.changed:
+            continue
+        k = next(style)
+        plain = id(c) in swept
+        colour = "#000000" if plain else diagram.COLOURS[k % len(diagram.COLOURS)]
+        mark = "*" if plain else diagram.MARKS[k % len(diagram.MARKS)]
+        (point,) = panel.plot(
+            [p.seconds.value], [p.error.value], color=colour, marker=mark, ms=13 if plain else 7, ls="", zorder=4
+        )
+        _bars(panel, p, colour)
+        handles.setdefault(f"{c.label}{f': {PROFILE_POINT}' if plain else ''}", point)
+        labels.setdefault(id(p), diagram.Label(_at(p), ""))
+    return list(labels.values()), lines
+
+
+def _at(p: WorkPoint) -> tuple[float, float]:
+    return p.seconds.value, p.error.value
+
+
+def _bars(panel: Axes, p: WorkPoint, colour: str) -> None:
+    for interval, along_x in ((p.seconds, True), (p.error, False)):
+        if math.isfinite(interval.low) and interval.low > 0:
+            ends = [interval.low, interval.high]
+            middle = [p.error.value] * 2 if along_x else [p.seconds.value] * 2
+            panel.plot(*((ends, middle) if along_x else (middle, ends)), color=colour, lw=1, alpha=0.3, zorder=2)
+
+
+def _ends(interval: Any) -> list[float]:
+    return [v for v in (interval.value, interval.low, interval.high) if math.isfinite(v) and v > 0]
+
+
+def _csv_row(p: WorkPoint, identity: str, on_front: bool, scenes: Sequence[str]) -> dict[str, Any]:
+    c = p.configuration
+    runs = [run for run in c.runs if run.scene in scenes]
+    return {
+        "configuration": c.label,
+        "method": c.method,
+        "switches": ", ".join(f"{name}={value}" for name, value in c.changed.items()),
+        "scenes": len(scenes),
+        "runs": len(runs),
+        "fit_seconds": p.seconds.value,
+        "fit_seconds_low": p.seconds.low,
+        "fit_seconds_high": p.seconds.high,
+        "total_seconds": seconds_interval(runs, "total_seconds").value,
+        "identity": identity,
+        "value": p.value.value,
+        "value_low": p.value.low,
+        "value_high": p.value.high,
+        "error": p.error.value,
+        "error_low": p.error.low,
+        "error_high": p.error.high,
+        "pareto": on_front,
+    }
+
+
+# ------------------------------------------------------------------------------------------------------ quality-time
+
+
+def _quality_time(
+    configs: Sequence[Configuration], headline: str, path: Path, title: str, about: str
+) -> list[tuple[Path, str]]:
+    known = curve_identities(configs)
+    metrics = [m for m in ("psnr", "flip") if any(Identity.parse(i).metric == m for i in known)]
+    regions = [headline, *(r for r in PARTITION if r != headline)]
+    panels = {
+        (metric, region): identity
+        for metric in metrics
+        for region in regions
+        for identity in known
+        if (Identity.parse(identity).metric, Identity.parse(identity).region) == (metric, region)
+    }
+    metrics = [m for m in metrics if any(metric == m for metric, _ in panels)]
+    regions = [r for r in regions if any(region == r for _, region in panels)]
+    if not panels:
+        return []
+    drawn, axes = diagram.figure(len(regions), len(metrics), width=4.2, height=3.8)
+    rows: list[dict[str, Any]] = []
+    handles: dict[str, Any] = {}
+    for k, panel in enumerate(axes):
+        metric, region = metrics[k // len(regions)], regions[k % len(regions)]
+        identity = panels.get((metric, region))
+        if identity is None:
+            panel.set_axis_off()
+            continue
+        shown = _curve_panel(panel, configs, identity, handles)
+        rows += shown
+        times, errors = [row["seconds"] for row in shown], [row["error"] for row in shown]
+        diagram.logarithmic(panel, times, errors)
+        _name_axes(panel, identity, "seconds of fitting")
+    if not handles:
+        return []
+    _finish(drawn, handles, f"Quality against time: {title}", about)
+    crowd = f"; dots: checkpoints of single runs; shaded: {LEVEL:.0%} interval" if len(configs) <= CROWD else ""
+    caption = (
+        f"Quality against the fit clock, {title} ({about}), by region. Lines: mean over scenes of the checkpoints of "
+        f"their runs{crowd}. Scoring does not count as time."
+    )
+    return [(diagram.save(drawn, path, rows), caption)]
+
+
+def _curve_panel(
+    panel: Axes, configs: Sequence[Configuration], identity: str, handles: dict[str, Any]
+) -> list[dict[str, Any]]:
+    """Draw every configuration's checkpoints and mean curve; gives what was drawn as rows."""
+    metric = Identity.parse(identity).metric
+    rows: list[dict[str, Any]] = []
+    for k, c in enumerate(configs):
+        colour, mark = diagram.COLOURS[k % len(diagram.COLOURS)], diagram.MARKS[k % len(diagram.MARKS)]
+        found = curves(c, identity)
+        points = [
+            {"kind": "checkpoint", "configuration": c.label, "scene": scene, "seed": seed, "identity": identity,
+             "seconds": float(t), "value": float(v), "error": error_of(metric, float(v))}
+            for (scene, seed), curve in found.items()
+            for t, v in zip(curve.seconds, curve.values, strict=True)
+            if error_of(metric, float(v)) > 0
+        ]  # fmt: skip
+        if not points:
+            continue
+        mean = _mean_curve(found)
+        errors = [error_of(metric, value) for _, value, _, _ in mean]
+        dash = diagram.DASHES[k // len(diagram.COLOURS) % len(diagram.DASHES)]
+        (line,) = panel.plot([t for t, *_ in mean], errors, color=colour, lw=1.8, ls=dash, zorder=3)
+        handles.setdefault(c.label, line)
+        if len(configs) <= CROWD:
+            low, high = ([error_of(metric, row[side]) for row in mean] for side in (2, 3))
+            panel.fill_between([t for t, *_ in mean], low, high, color=colour, alpha=0.15, lw=0, zorder=1)
+            panel.plot(
+                [p["seconds"] for p in points], [p["error"] for p in points],
+                ls="", marker=mark, ms=3.5, color=colour, alpha=0.35, mew=0, zorder=2,
+            )  # fmt: skip
+            rows += points
+        rows += [
+            {"kind": "mean", "configuration": c.label, "identity": identity, "seconds": t, "value": value,
+             "error": error_of(metric, value), "value_low": low_end, "value_high": high_end}
+            for t, value, low_end, high_end in mean
+        ]  # fmt: skip
+    return rows
+
+
+def _mean_curve(found: dict[tuple[str, int], QualityCurve]) -> list[tuple[float, float, float, float]]:
+    """(seconds, value, low, high) of the mean over scenes of the mean over seeds, where every run has a value."""
+    start = max(float(c.seconds[0]) for c in found.values())
+    end = max(float(c.seconds[-1]) for c in found.values())
+    times = np.geomspace(start, end, GRID) if start < end else np.array([start])
+    times[0], times[-1] = start, end  # rounding must not put the first one before the first point
+    by_scene: dict[str, list[Any]] = {}
+    for (scene, _), curve in found.items():
+        by_scene.setdefault(scene, []).append(curve.at(times))
+    means = np.stack([np.mean(values, 0) for values in by_scene.values()], -1)  # [times, scenes]
+    known = np.isfinite(means).all(-1)
+    times, means = times[known], means[known]
+    low, high = interval_ends(means, LEVEL) if len(by_scene) > 1 else np.full((2, len(times)), np.nan)
+    return [
+        (float(t), float(v), float(a), float(b)) for t, v, a, b in zip(times, means.mean(-1), low, high, strict=True)
+    ]
+
+
+# ------------------------------------------------------------------------------------------------------------- shared
+
+
+def _name_axes(panel: Axes, identity: str, below: str) -> None:
+    """Name the axes; a PSNR's error gets its decibels on the right."""
+    metric = Identity.parse(identity).metric
+    panel.set_xlabel(below)
+    panel.set_ylabel(f"{AXES.get(metric, metric)}  (less is better)")
+    panel.set_title(Identity.parse(identity).region)
+    if metric == "psnr":
+        beside = panel.twinx()
+        low, high = panel.get_ylim()
+        beside.set_ylim(-20 * math.log10(low), -20 * math.log10(high))  # linear in dB is logarithmic in RMSE
+        beside.set_ylabel("PSNR, dB")
+        beside.grid(visible=False)
+        beside.spines["right"].set_visible(True)
+
+
+def _finish(drawn: Figure, handles: dict[str, Any], title: str, about: str) -> None:
+    """Title on top, legend below, outside the axes."""
+    drawn.suptitle(f"{title}\n{about}", fontsize=11)
+    texts = [fill(label, LEGEND_WIDTH) for label in handles]
+    columns = 1 if max(len(t) for t in texts) > 42 or len(texts) < 3 else 2
+    drawn.legend(list(handles.values()), texts, loc="outside lower center", ncols=columns, frameon=False)

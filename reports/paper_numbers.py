@@ -1,0 +1,204 @@
+"""The paper's numbers as data: `paper_tables.toml` beside this, read and checked.
+
+A number is the text that the paper printed, so that 22.40 stays 22.40.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from ihbench.errors import BadInput
+from ihbench.metrics.identity import Metric, metric_of
+
+ABSENT = "--"  # as the paper prints it
+STATUSES = ("reported", "quoted", "unreliable", "absent")
+PRINTED = ("", "best", "second")
+
+
+@dataclass(frozen=True)
+class Digits:
+    """How a column writes measured numbers: a number of decimals, or of significant digits."""
+
+    decimals: int | None = None
+    significant: int | None = None
+
+    def decimals_of(self, value: float) -> int:
+        """Decimals for a finite value. Significant digits never ask for more than three decimals."""
+        if self.significant is None:
+            return self.decimals or 0
+        rounded = abs(float(f"{value:.{self.significant - 1}e}"))
+        exponent = math.floor(math.log10(rounded)) if rounded else 0
+        return min(max(self.significant - 1 - exponent, 0), 3)
+
+
+@dataclass(frozen=True)
+class Column:
+    """One metric on one data set."""
+
+    group: str  # the data set, as the paper heads it
+    key: str  # "psnr"
+    digits: Digits
+
+    @property
+    def metric(self) -> Metric:
+        return metric_of(self.key)
+
+    @property
+    def title(self) -> str:
+        """Such as "PSNR ↑ (dB)"."""
+        unit = f" ({self.metric.unit})" if self.metric.unit else ""
+        return f"{self.metric.title} {self.metric.arrow}{unit}"
+
+    def text(self, value: float, like: float | None = None) -> str:
+        """A value in the column's unit, with the decimals of `like` if given; "—" when absent, "∞" when infinite."""
+        if math.isnan(value):
+            return "—"
+        if math.isinf(value):
+            return "∞"
+        return f"{value:.{self.digits.decimals_of(value if like is None else like)}f}"
+
+
+@dataclass(frozen=True)
+class Group:
+    """Columns of one data set, and the runs that fill them with measured numbers."""
+
+    name: str
+    columns: tuple[Column, ...]
+    protocols: tuple[str, ...]  # ids without version
+    views: str = ""  # the protocol's group of test views; "" for its own
+    note: str = ""
+    measured_only: bool = False  # the paper has no such columns
+
+
+@dataclass(frozen=True)
+class Component:
+    """A part of a method that ablation rows have or have not, told from the switches of a run."""
+
+    name: str
+    on: tuple[str, ...] = ()  # switches that must all be on
+    several: str = ""  # switch that must hold more than one value
+    measured_only: bool = False
+
+
+@dataclass(frozen=True)
+class PaperCell:
+    text: str  # as printed
+    status: str
+    footnotes: tuple[str, ...] = ()
+
+    @property
+    def value(self) -> float:
+        return math.nan if self.text == ABSENT else float(self.text)
+
+
+@dataclass(frozen=True)
+class PaperRow:
+    name: str
+    cells: tuple[PaperCell, ...]
+    section: str = ""
+    components: tuple[bool, ...] = ()
+    printed: str = ""  # the paper's own mark on this row's numbers
+
+
+@dataclass(frozen=True)
+class PaperTable:
+    name: str
+    title: str
+    source: str
+    head: str  # of the column of row names
+    groups: tuple[Group, ...]
+    rows: tuple[PaperRow, ...]
+    components: tuple[Component, ...] = ()
+    notes: tuple[str, ...] = ()
+    footnotes: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """Those that the paper has."""
+        return tuple(column for group in self.groups if not group.measured_only for column in group.columns)
+
+
+def paper_table(name: str, file: Path | None = None) -> PaperTable:
+    """One table of the paper, or of a file like `paper_tables.toml`.
+
+    Raises `BadInput` for an unknown table, and for a file with cells that are no numbers, rows of the wrong length,
+    unknown statuses or footnotes.
+    """
+    where = str(file or "paper_tables.toml")
+    try:
+        text = (file or files("ihbench.reports") / "paper_tables.toml").read_text(encoding="utf-8")
+        content = tomllib.loads(text)
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise BadInput(f"{where}: cannot be read ({error})") from error
+    known = [key for key, value in content.items() if isinstance(value, dict) and "row" in value]
+    if name not in known:
+        raise BadInput(f"{where}: no table {name!r}; known: {', '.join(known) or 'none'}")
+    try:
+        return _table(name, content[name], content["source"], content["digits"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise BadInput(
+            f"{where}: {name}: {type(error).__name__} {error}; see the shipped paper_tables.toml"
+        ) from error
+
+
+def _table(name: str, raw: dict[str, Any], source: str, digits: dict[str, dict[str, int]]) -> PaperTable:
+    groups = tuple(
+        Group(
+            name=g["name"],
+            columns=tuple(Column(g["name"], key, Digits(**digits[key])) for key in g["metrics"]),
+            protocols=tuple(g["protocols"]),
+            views=g.get("views", ""),
+            note=g.get("note", ""),
+            measured_only=g.get("measured_only", False),
+        )
+        for g in raw["group"]
+    )
+    table = PaperTable(
+        name=name,
+        title=raw["title"],
+        source=f"{source}, {raw['where']}",
+        head=raw["head"],
+        groups=groups,
+        rows=tuple(_row(row) for row in raw["row"]),
+        components=tuple(
+            Component(c["name"], tuple(c.get("on", ())), c.get("several", ""), c.get("measured_only", False))
+            for c in raw.get("component", ())
+        ),
+        notes=tuple(raw.get("notes", ())),
+        footnotes=dict(raw.get("footnotes", {})),
+    )
+    parts = [component for component in table.components if not component.measured_only]
+    for row in table.rows:
+        if len(row.cells) != len(table.columns) or len(row.components) != len(parts):
+            raise ValueError(
+                f"row {row.name!r}: expected {len(table.columns)} cells and {len(parts)} components, "
+                f"got {len(row.cells)} and {len(row.components)}"
+            )
+        for cell in row.cells:
+            for key in cell.footnotes:
+                if key not in table.footnotes:
+                    raise ValueError(f"row {row.name!r}: unknown footnote {key!r}")
+    return table
+
+
+def _row(raw: dict[str, Any]) -> PaperRow:
+    own = raw.get("status", "quoted")
+    cells = []
+    for k, text in enumerate(raw["cells"]):
+        status = "absent" if text == ABSENT else "unreliable" if k in raw.get("unreliable", ()) else own
+        if status not in STATUSES:
+            raise ValueError(f"row {raw['name']!r}: status {status!r}, expected one of {', '.join(STATUSES)}")
+        cell = PaperCell(text, status, tuple(raw.get("footnotes", {}).get(str(k), ())))
+        if text != ABSENT and not math.isfinite(cell.value):
+            raise ValueError(f"row {raw['name']!r}: {text!r} is no number; write {ABSENT!r} for none")
+        cells.append(cell)
+    printed = raw.get("printed", "")
+    if printed not in PRINTED:
+        raise ValueError(f"row {raw['name']!r}: printed {printed!r}, expected best or second")
+    return PaperRow(raw["name"], tuple(cells), raw.get("section", ""), tuple(raw.get("components", ())), printed)

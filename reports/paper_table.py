@@ -1,0 +1,393 @@
+"""A table of the paper as data: quoted rows, and blocks of rows measured here, every cell with its status.
+
+Rows that cannot be compared never stand in one block: quoted numbers (their definition is unknown), measurements on
+real data, measurements on stand-ins, and runs under other protocols, profiles or variants of the data each have their
+own. Marks are computed inside a block.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+from ihbench.calibration import DESCRIPTIONS, ROWS
+from ihbench.metrics import Identity, Mean, macro_mean
+from ihbench.metrics.statistics import Interval, mean_interval
+from ihbench.reports.labels import by_label
+from ihbench.reports.marks import marks_by_interval, marks_by_value
+from ihbench.reports.paper_numbers import Column, Component, Group, PaperTable
+from ihbench.reports.significance import LEVEL, scene_means
+from ihbench.results import RunResult, group_row
+
+Kind = Literal["quoted", "real data", "stand-in"]
+MEASURED = {"real data": "measured", "stand-in": "stand-in"}  # a block's kind -> the status of its numbers
+YES, NO, UNKNOWN = "✓", "", "?"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One number, what it is worth, and what must be said of it."""
+
+    text: str  # as shown, without marks: "24.65", "24.65 [23.90, 25.40]", "—"
+    value: float  # in the column's unit; NaN when absent
+    status: str  # reported, quoted, unreliable, measured, stand-in, absent
+    low: float = math.nan  # of the interval over scenes
+    high: float = math.nan
+    scenes: int = 0  # that the mean runs over; 0 for quoted numbers
+    mark: str = ""  # best, second
+    reason: str = ""  # of an absent number
+    identity: str = ""  # of a measured number
+    footnotes: tuple[str, ...] = ()  # letters
+
+    @property
+    def number(self) -> str:
+        """The text without the interval."""
+        return self.text.partition(" ")[0]
+
+    @property
+    def interval(self) -> str:
+        return self.text.partition(" ")[2]
+
+
+@dataclass(frozen=True)
+class Row:
+    label: str
+    status: str
+    cells: tuple[Cell, ...]
+    section: str = ""
+    components: tuple[str, ...] = ()  # YES, NO or UNKNOWN
+    calibration: bool = False  # bounds the methods, is not ranked
+
+
+@dataclass(frozen=True)
+class Block:
+    title: str
+    kind: Kind
+    groups: tuple[Group, ...]
+    rows: tuple[Row, ...]
+    components: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        return tuple(column for group in self.groups for column in group.columns)
+
+
+@dataclass(frozen=True)
+class Frame:
+    name: str  # "table1"
+    title: str
+    source: str
+    head: str  # of the column of row labels
+    blocks: tuple[Block, ...]
+    footnotes: Mapping[str, str]  # letter -> text
+    notes: tuple[str, ...] = ()
+
+
+@dataclass
+class _Footnotes:
+    """Letters for texts, in the order in which they are first asked for."""
+
+    letters: dict[str, str] = field(default_factory=dict)
+
+    def letter(self, text: str) -> str:
+        return self.letters.setdefault(text, _letter(len(self.letters)))
+
+    def of(self, texts: Iterable[str]) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(self.letter(text) for text in texts))
+
+
+def _letter(k: int) -> str:
+    """a, b, …, z, aa, ab, …"""
+    return ("" if k < 26 else _letter(k // 26 - 1)) + chr(ord("a") + k % 26)
+
+
+def build_frame(table: PaperTable, results: Sequence[RunResult], region: str = "", as_printed: bool = False) -> Frame:
+    """The table's frame, filled from the paper and from these runs.
+
+    `results` under other protocols than the table's are left out. `region` is that of measured numbers; "" is every
+    protocol's headline. `as_printed` gives quoted rows the paper's own marks in place of computed ones.
+    """
+    footnotes = _Footnotes()
+    blocks = [_quoted(table, footnotes, as_printed)]
+    blocks += _measured(table, results, region, footnotes)
+    notes = [*table.notes]
+    if len(blocks) == 1:
+        protocols = dict.fromkeys(p for group in table.groups for p in group.protocols)
+        notes.append(f"No measured rows: no finished run under {', '.join(protocols)} was found.")
+    letters = {letter: text for text, letter in footnotes.letters.items()}
+    return Frame(table.name, table.title, table.source, table.head, tuple(blocks), letters, tuple(notes))
+
+
+# ---------------------------------------------------------------------------------------------------- quoted rows
+
+
+def _quoted(table: PaperTable, footnotes: _Footnotes, as_printed: bool) -> Block:
+    marks: list[list[str]]
+    if as_printed:
+        marks = [[row.printed if cell.status != "absent" else "" for cell in row.cells] for row in table.rows]
+    else:
+        columns = [
+            marks_by_value([row.cells[k].value for row in table.rows], column.metric.higher_is_better)
+            for k, column in enumerate(table.columns)
+        ]
+        marks = [[column[j] for column in columns] for j in range(len(table.rows))]
+    rows = []
+    for row, marked in zip(table.rows, marks, strict=True):
+        cells = []
+        for cell, mark in zip(row.cells, marked, strict=True):
+            absent = cell.status == "absent"
+            reason = "not available in the paper" if absent else ""
+            letters = footnotes.of(table.footnotes[key] for key in cell.footnotes)
+            text = "—" if absent else cell.text
+            cells.append(Cell(text, cell.value, cell.status, mark=mark, reason=reason, footnotes=letters))
+        status = next((c.status for c in row.cells if c.status in ("reported", "quoted")), row.cells[0].status)
+        parts = tuple(YES if has else NO for has in row.components)
+        rows.append(Row(row.name, status, tuple(cells), row.section, parts))
+    own, others = (any(row.status == status for row in rows) for status in ("reported", "quoted"))
+    notes = [
+        *(["reported: the paper about its own method."] if own else []),
+        *(["quoted: the paper about somebody else's method."] if others else []),
+        *(["—: not available in the paper."] if any(c.status == "absent" for r in rows for c in r.cells) else []),
+        "Marks are the paper's own." if as_printed else
+        "Marks are computed from the printed values alone: the paper gives no intervals, so none of them is known to "
+        "be beyond chance.",
+        *(group.note for group in table.groups if group.note and not group.measured_only),
+    ]  # fmt: skip
+    return Block(
+        "Quoted from the paper, not measured here",
+        "quoted",
+        tuple(group for group in table.groups if not group.measured_only),
+        tuple(rows),
+        tuple(part.name for part in table.components if not part.measured_only),
+        tuple(notes),
+    )
+
+
+# -------------------------------------------------------------------------------------------------- measured rows
+
+
+def _measured(table: PaperTable, results: Sequence[RunResult], region: str, footnotes: _Footnotes) -> Iterator[Block]:
+    """One block for each combination of data, profile and protocol; real data first."""
+    wanted = {protocol for group in table.groups for protocol in group.protocols}
+    by_kind: dict[tuple[str, str], list[RunResult]] = {}
+    for run in results:
+        if _protocol(run) in wanted:
+            by_kind.setdefault((run.record["about"]["standin"], run.identity["profile"]), []).append(run)
+    for standin, profile in sorted(by_kind, key=lambda key: (bool(key[0]), *key)):
+        runs = by_kind[standin, profile]
+        # runs of one data set under several protocols, digests or variants go into several blocks
+        keys = [_comparable(group, runs) for group in table.groups]
+        for k in range(max(map(len, keys))):
+            filled = [
+                (group, [run for run in runs if run.group == having[k]])
+                for group, having in zip(table.groups, keys, strict=True)
+                if k < len(having)
+            ]
+            yield _measured_block(table, filled, standin, profile, region, footnotes)
+
+
+def _protocol(run: RunResult) -> str:
+    return run.identity["protocol"].partition("@")[0]
+
+
+def _comparable(group: Group, runs: Sequence[RunResult]) -> list[tuple[str, str, str, str]]:
+    """What runs of this data set there are that may stand in one table, in the order of the table's protocols."""
+    found = [run for name in group.protocols for run in runs if _protocol(run) == name]
+    return list(dict.fromkeys(run.group for run in found))
+
+
+def _measured_block(
+    table: PaperTable,
+    filled: Sequence[tuple[Group, list[RunResult]]],  # a data set and its runs, done or not
+    standin: str,
+    profile: str,
+    region: str,
+    footnotes: _Footnotes,
+) -> Block:
+    everything = list({id(run): run for _, runs in filled for run in runs}.values())
+    # a run that failed early never said how it was configured: it is told of, but belongs to no row
+    labelled = by_label([run for run in everything if "changed" in run.record["about"]])
+    kind: Kind = "stand-in" if standin else "real data"
+    notes: list[str] = []
+    if standin:
+        notes.append(
+            f"Made on {standin}: procedural people of the bench in the data set's layout, not the data set. These "
+            "numbers compare rows of this block with each other and with nothing else."
+        )
+    unlabelled = [run for run in everything if "changed" not in run.record["about"]]
+    notes += [f"Not done: {run.method} on {_outcome(run)}." for run in unlabelled]
+    columns: list[list[Cell]] = []  # by column, then by row
+    calibrations = [name for name in ROWS if any(name in run.rows for run in everything)]
+    for group, runs in filled:
+        done = [run for run in runs if run.status == "done"]
+        shown_region = region or (done[0].record["about"]["headline"] if done else "")
+        identities = [_identity(done, group, column.key, shown_region) for column in group.columns]
+        notes += _about(group, runs, done, shown_region, identities)
+        for column, identity in zip(group.columns, identities, strict=True):
+            ranked = [
+                _cell(column, [run for run in having if run in runs], group.views, identity, kind, footnotes)
+                for having in labelled.values()
+            ]
+            marks = marks_by_interval(
+                list(labelled),
+                [float(cell.number) if math.isfinite(cell.value) else math.nan for cell, _ in ranked],
+                [scenes for _, scenes in ranked],
+                column.metric.higher_is_better,
+                LEVEL,
+            )
+            if marks.withheld:
+                notes.append(f"{column.group}, {column.metric.title}: {marks.withheld}.")
+            cells = [replace(cell, mark=mark) for (cell, _), mark in zip(ranked, marks.marks, strict=True)]
+            for name in calibrations:
+                row = group_row(name, group.views)
+                cells.append(_bound(column, done, row, identity, kind, footnotes))
+            columns.append(cells)
+    parts = [_components(table.components, having) for having in labelled.values()]
+    rows = [
+        Row(label, MEASURED[kind], tuple(cells[j] for cells in columns), components=parts[j])
+        for j, label in enumerate(labelled)
+    ]
+    rows += [
+        Row(name, MEASURED[kind], tuple(cells[len(rows) + k] for cells in columns),
+            components=(NO,) * len(table.components), calibration=True)
+        for k, name in enumerate(calibrations)
+    ]  # fmt: skip
+    notes.append(
+        f"Mean over seeds within a scene, then over scenes, with the {LEVEL:.0%} interval over scenes. A mark says "
+        "that the row differs from every other one over common scenes (interval of the paired difference)."
+    )
+    notes += [f"{name}: {DESCRIPTIONS[name]}; a bound, not ranked." for name in calibrations]
+    title = f"Measured here on {'STAND-INS, not on real data' if standin else 'real data'}, {profile} profile"
+    used = tuple(group for group, _ in filled)
+    return Block(title, kind, used, tuple(rows), tuple(part.name for part in table.components), tuple(notes))
+
+
+def _identity(done: Sequence[RunResult], group: Group, metric: str, region: str) -> str:
+    """The first definition of a metric in a region that these runs have; one with numbers before one without."""
+    found = [
+        identity
+        for run in done
+        for identity in run.rows.get(group_row(run.method, group.views), {})
+        if Identity.parse(identity).metric == metric and Identity.parse(identity).region == region
+    ]
+    present = [i for i in found if any(not m.absent for m in _means(done, i, group.views))]
+    return next(iter(present or found), "")
+
+
+def _means(runs: Sequence[RunResult], identity: str, views: str) -> list[Mean]:
+    rows = [run.rows.get(group_row(run.method, views), {}) for run in runs]
+    return [row[identity] for row in rows if identity in row]
+
+
+def _cell(
+    column: Column, runs: Sequence[RunResult], views: str, identity: str, kind: Kind, footnotes: _Footnotes
+) -> tuple[Cell, dict[str, float]]:
+    """A method's cell, and its finite means by scene."""
+    done = [run for run in runs if run.status == "done"]
+    if not done:
+        why = "; ".join(dict.fromkeys(_outcome(run) for run in runs)) or f"not run on {column.group}"
+        return _absent(why, footnotes), {}
+    if not identity:
+        return _absent(f"{column.metric.title} was not computed in this region", footnotes), {}
+    means = scene_means(done, identity, group_row(done[0].method, views))
+    if not means:
+        return _absent(f"not scored as {identity}", footnotes), {}
+    cell = _filled(column, means, identity, kind, footnotes)
+    remarks = [_outcome(run) for run in runs if run.status != "done"]
+    scored = [(run.scene, run.rows.get(group_row(run.method, views), {}).get(identity)) for run in done]
+    remarks += [f"{scene}: {mean.note}" for scene, mean in scored if mean is not None and mean.note]
+    cell = replace(cell, footnotes=(*cell.footnotes, *footnotes.of(dict.fromkeys(remarks))))
+    return cell, {scene: mean.value for scene, mean in means.items() if math.isfinite(mean.value)}
+
+
+def _bound(
+    column: Column, done: Sequence[RunResult], row: str, identity: str, kind: Kind, footnotes: _Footnotes
+) -> Cell:
+    """A calibration row's cell: the same for every run on a scene."""
+    means = scene_means(done, identity, row)
+    if not means:
+        return _absent(f"not scored on {column.group}", footnotes)
+    cell = _filled(column, means, identity, kind, footnotes)
+    return replace(cell, text=cell.number, low=math.nan, high=math.nan)
+
+
+def _filled(column: Column, means: Mapping[str, Mean], identity: str, kind: Kind, footnotes: _Footnotes) -> Cell:
+    total, scale = macro_mean(means), column.metric.scale
+    if total.absent:
+        return _absent(total.reason, footnotes)
+    finite = {scene: mean.value for scene, mean in means.items() if math.isfinite(mean.value)}
+    value, low, high = total.value * scale, math.nan, math.nan
+    text = column.text(value)
+    if len(finite) > 1:
+        interval: Interval = mean_interval(finite, LEVEL)
+        low, high = interval.low * scale, interval.high * scale
+        text += f" [{column.text(low, value)}, {column.text(high, value)}]"
+    letters = footnotes.of([f"over scenes: {total.note}"] if total.note else [])
+    return Cell(text, value, MEASURED[kind], low, high, max(len(finite), 1), identity=identity, footnotes=letters)
+
+
+def _absent(reason: str, footnotes: _Footnotes) -> Cell:
+    return Cell("—", math.nan, "absent", reason=reason, footnotes=footnotes.of([reason]))
+
+
+def _outcome(run: RunResult) -> str:
+    reason = f" ({run.record['reason']})" if run.record["reason"] else ""
+    return f"{run.scene}, seed {run.identity['seed']}: {run.status}{reason}"
+
+
+def _about(
+    group: Group, runs: Sequence[RunResult], done: Sequence[RunResult], region: str, identities: Sequence[str]
+) -> list[str]:
+    """What the numbers of one data set are."""
+    protocol, digest, _, data = runs[0].group
+    scenes = sorted({run.scene for run in done})
+    subjects = runs[0].record["about"].get("protocol", {}).get("subjects", {})
+    whole = len(subjects.get("standin" if runs[0].record["about"]["standin"] else "names", ()))
+    counted = f"{len(scenes)} of {whole} scenes" if whole else f"{len(scenes)} scenes"
+    seeds = sorted({run.identity["seed"] for run in done})
+    views = f", views of training ({group.views})" if group.views else ""
+    notes = [
+        f"{group.name}: {protocol} (digest {digest}), {data.replace('*', '')}; region {region or 'none'}{views}; "
+        f"{counted} ({', '.join(scenes) or 'none'}); seeds {', '.join(map(str, seeds)) or 'none'}."
+    ]
+    known = [identity for identity in identities if identity]
+    return [*notes, f"{group.name}: {', '.join(known)}."] if known else notes
+
+
+# ------------------------------------------------------------------------------------------- components of a method
+
+
+def _components(components: Sequence[Component], runs: Sequence[RunResult]) -> tuple[str, ...]:
+    """Which components these runs of one configuration had. A scene's plan may have left one out: then it is told as
+    not there; where scenes differ, or where the method has no such switch, as unknown."""
+    configs = [_in_force(run) for run in runs]
+    return tuple(_one(component, configs) for component in components)
+
+
+def _in_force(run: RunResult) -> dict[str, Any]:
+    """Flat name -> value of the switches, as the scene's plan left them."""
+    omitted = {o["field"]: o["value"] for o in run.record["about"].get("left_out", ())}
+    return dict(_flat(run.identity.get("config", {}))) | omitted
+
+
+def _flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in config.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _one(component: Component, configs: Sequence[Mapping[str, Any]]) -> str:
+    wanted = (*component.on, *([component.several] if component.several else []))
+    if any(name not in config for config in configs for name in wanted):
+        return UNKNOWN
+    found = {
+        all(bool(config[name]) for name in component.on)
+        and (not component.several or len(config[component.several]) > 1)
+        for config in configs
+    }
+    return UNKNOWN if len(found) != 1 else YES if found.pop() else NO

@@ -1,0 +1,333 @@
+"""Error against run time: what a row costs and how wrong it is, which rows no other beats, time to a stated quality,
+and area under the quality-time curve."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from statistics import median
+
+from ihbench.metrics import Identity
+from ihbench.metrics.identity import metric_of
+from ihbench.metrics.statistics import Interval, mean_interval, median_interval
+from ihbench.quality_time import (
+    NEVER,
+    QualityCurve,
+    Target,
+    area_under_curve,
+    common_window,
+    curve_of,
+    error_of,
+    pareto_set,
+    round_targets,
+    time_to_quality,
+)
+from ihbench.reports.clock import clock_notes
+from ihbench.reports.configurations import Configuration, configurations
+from ihbench.reports.document import Block, Heading, Paragraph, Table, Words, bullets
+from ihbench.reports.significance import LEVEL, per_scene
+from ihbench.results import RunResult
+
+ON_THE_CURVE = ("psnr", "flip")  # targets are chosen for these where none is stated
+SPREAD = f"{LEVEL:.0%}"
+
+
+@dataclass(frozen=True)
+class WorkPoint:
+    """One configuration in a work-precision diagram."""
+
+    configuration: Configuration
+    seconds: Interval  # of the fit
+    value: Interval  # of the metric, not scaled
+    error: Interval  # the same as an error, see `error_of`
+
+
+# ----------------------------------------------------------------------------------------------------------- numbers
+
+
+def shared_scenes(configs: Sequence[Configuration]) -> list[str]:
+    """Scenes that every configuration was run on: only over these can they be compared."""
+    common = set.intersection(*({run.scene for run in c.runs} for c in configs)) if configs else set()
+    return sorted(common)
+
+
+def work_points(configs: Sequence[Configuration], identity: str, scenes: Sequence[str]) -> list[WorkPoint]:
+    """Seconds and error of every configuration over these scenes; those without a finite number are left out."""
+    found = []
+    for c in configs:
+        runs = [run for run in c.runs if run.scene in scenes]
+        values = per_scene(runs, identity)
+        if not values:
+            continue
+        value = mean_interval(values, LEVEL)
+        metric = Identity.parse(identity).metric
+        ends = sorted(error_of(metric, end) for end in (value.low, value.high))
+        error = Interval(error_of(metric, value.value), ends[0], ends[1], value.level, value.n, value.method)
+        found.append(WorkPoint(c, seconds_interval(runs), value, error))
+    return found
+
+
+def seconds_interval(runs: Sequence[RunResult], key: str = "fit_seconds") -> Interval:
+    """Mean seconds with its interval: over scenes (each the mean of its repeats), or over repeats of one scene."""
+    by_scene: dict[str, list[float]] = {}
+    for run in runs:
+        by_scene.setdefault(run.scene, []).append(float(run.record["about"][key]))
+    if len(by_scene) > 1:
+        return mean_interval(by_scene, LEVEL)
+    return mean_interval({str(k): seconds for k, seconds in enumerate(next(iter(by_scene.values())))}, LEVEL)
+
+
+def curves(configuration: Configuration, identity: str) -> dict[tuple[str, int], QualityCurve]:
+    """(scene, seed) -> the run's curve; runs without such a curve are left out."""
+    higher = metric_of(identity).higher_is_better
+    found = {}
+    for run in configuration.runs:
+        curve = curve_of(run.curve, identity, higher)
+        if len(curve.values):
+            found[run.scene, run.identity["seed"]] = curve
+    return found
+
+
+def curve_identities(configs: Sequence[Configuration]) -> list[str]:
+    """Identities that any run has a curve of, in the order of the file."""
+    return list(dict.fromkeys(i for c in configs for run in c.runs for p in run.curve for i in p["scores"]))
+
+
+def times_to(target: float, found: Mapping[tuple[str, int], QualityCurve], scenes: Sequence[str]) -> dict[str, float]:
+    """Scene -> seconds to the quality, the median over its seeds: `NEVER` where half or more never get there."""
+    by_scene: dict[str, list[float]] = {}
+    for (scene, _), curve in found.items():
+        if scene in scenes:
+            by_scene.setdefault(scene, []).append(time_to_quality(curve, target))
+    return {scene: median(times) for scene, times in by_scene.items()}
+
+
+# ---------------------------------------------------------------------------------------------------------- sections
+
+
+def run_time_section(
+    runs: Sequence[RunResult], identities: Sequence[str], headline: str, targets: Sequence[Target] = ()
+) -> list[Block]:
+    """Seconds against error of the rows of one group; nothing where no run has a fit time."""
+    configs = configurations(runs)
+    if not configs:
+        return []
+    blocks: list[Block] = [Heading(3, "Error against run time")]
+    blocks += _cost_table(configs, identities, headline)
+    blocks += _quality_times(configs, headline, targets)
+    return blocks + bullets(clock_notes({c.label: c.runs for c in configs}))
+
+
+def across_sizes_section(results: Sequence[RunResult]) -> list[Block]:
+    """Where one protocol was run under several profiles or image sizes: their rows side by side, with a warning."""
+    blocks: list[Block] = []
+    for (name, _), runs in same_protocol(results).items():
+        headline = runs[0].record["about"]["headline"]
+        identities = list(dict.fromkeys(i for run in runs for i in run.rows[run.method]))
+        configs = configurations(runs, across=True)
+        if shared_scenes(configs):
+            table = _cost_table(configs, identities, headline)
+            warning = (
+                "Profiles and image sizes are scored on test images of different size, maybe of different views: "
+                "their seconds can be compared, their errors only with care."
+            )
+            blocks += [Heading(2, f"{name}: profiles and image sizes"), Paragraph(warning), *table]
+    return blocks
+
+
+def same_protocol(results: Sequence[RunResult]) -> dict[tuple[str, str], list[RunResult]]:
+    """(protocol, data) -> finished runs under it, whatever their profile and image size, where there are several."""
+    found: dict[tuple[str, str], list[RunResult]] = {}
+    for run in results:
+        if run.status == "done" and run.record["about"].get("fit_seconds") is not None:
+            name = "+".join(p for p in run.identity["protocol"].split("+") if not p.startswith("size="))
+            found.setdefault((name, run.data), []).append(run)
+    return {
+        key: runs
+        for key, runs in found.items()
+        if len({(run.identity["protocol"], run.identity["profile"]) for run in runs}) > 1
+    }
+
+
+def _cost_table(configs: Sequence[Configuration], identities: Sequence[str], headline: str) -> list[Block]:
+    columns = [i for i in identities if Identity.parse(i).region == headline]
+    scenes = shared_scenes(configs)
+    if not scenes:
+        return [Paragraph("These rows have no scene in common: their seconds and errors cannot be compared.")]
+    points = {i: {p.configuration.label: p for p in work_points(configs, i, scenes)} for i in columns}
+    columns = [i for i in columns if points[i]]
+    best: dict[str, list[str]] = {}
+    for i in columns:
+        having = list(points[i].values())
+        chosen = pareto_set([p.seconds.value for p in having], [p.error.value for p in having])
+        for k in chosen:
+            best.setdefault(having[k].configuration.label, []).append(metric_of(i).title)
+    on_gpu = any(_device_mb(run) > 0 for c in configs for run in c.runs)
+    rows: list[tuple[Words, ...]] = []
+    for c in configs:
+        runs = [run for run in c.runs if run.scene in scenes]
+        cells = [
+            c.label,
+            str(len(runs)),
+            _interval(seconds_interval(runs), "{:.3g}"),
+            f"{seconds_interval(runs, 'total_seconds').value:.0f}",
+            f"{max(float(run.record['about']['peak_mb']) for run in runs):.0f}",
+        ]
+        cells += [f"{max(_device_mb(run) for run in runs):.0f}"] if on_gpu else []
+        for i in columns:
+            point = points[i].get(c.label)
+            cells.append("—" if point is None else _scored(point.value, i))
+        cells.append(", ".join(best.get(c.label, [])) or "—")
+        rows.append(tuple(cells))
+    metrics = [f"{metric_of(i).title} {metric_of(i).arrow}" for i in columns]
+    known = [seconds_interval([run for run in c.runs if run.scene in scenes]) for c in configs]
+    kinds = sorted({interval.method for interval in known if math.isfinite(interval.low)})
+    head = ["method", "runs", f"fit s [{SPREAD}]" if kinds else "fit s", "total s", "peak MB"]
+    head += ["GPU MB"] if on_gpu else []
+    told = (
+        f"Region {headline}, {len(scenes)} scene{'s' if len(scenes) > 1 else ''} that all rows have. The fit clock "
+        "stands still while checkpoints are scored and states are saved; total s is the whole run. Pareto: by these "
+        "means no other row is as fast and better in this metric."
+    )
+    told += f" Intervals: {'; '.join(kinds)}." if kinds else ""
+    return [Table((*head, *metrics, "Pareto"), tuple(rows)), Paragraph(told)]
+
+
+def _quality_times(configs: Sequence[Configuration], headline: str, targets: Sequence[Target]) -> list[Block]:
+    known = curve_identities(configs)
+    if not known:
+        return [Paragraph("No run has a quality-time curve (curve.jsonl).")]
+    without = [run.folder.name for c in configs for run in c.runs if not run.curve]
+    notes: list[Words] = [f"without a readable curve.jsonl: {', '.join(without)}"] if without else []
+    return [*_time_table(configs, known, headline, targets), *_area_table(configs, known), *bullets(notes)]
+
+
+def _time_table(
+    configs: Sequence[Configuration], known: Sequence[str], headline: str, targets: Sequence[Target]
+) -> list[Block]:
+    scenes = shared_scenes(configs)
+    if not targets:
+        targets = _chosen_targets(configs, known, headline)
+    columns: list[tuple[Target, str]] = []
+    missing: list[Words] = []
+    for target in targets:
+        region = target.region or headline
+        found = [i for i in known if (Identity.parse(i).metric, Identity.parse(i).region) == (target.metric, region)]
+        if found:
+            columns.append((target, found[0]))
+        else:
+            missing.append(f"no curve of {target.metric} in {region}: scored at the end of a run only, or not at all")
+    if not columns or not scenes:
+        return bullets(missing)
+    rows = []
+    for c in configs:
+        cells = [_time_cell(curves(c, i), target.value, i, scenes) for target, i in columns]
+        rows.append((c.label, *cells))
+    head = ["method"]
+    for target, i in columns:
+        metric, sign = metric_of(i), "≥" if metric_of(i).higher_is_better else "≤"
+        where = "" if Identity.parse(i).region == headline else f" {Identity.parse(i).region}"
+        unit = " dB" if metric.unit == "dB" else ""
+        head.append(f"{metric.title}{where} {sign} {target.value * metric.scale:g}{unit}")
+    views = sorted({str(p.get("views", "?")) for c in configs for run in c.runs for p in run.curve})
+    told = (
+        f"Seconds of fitting until the quality was first reached on {' or '.join(views)} fixed test views (region "
+        f"{headline} where none is named): median over scenes of the median over seeds, in brackets the order "
+        f"statistics that hold the true median with {SPREAD} confidence, or, under 6 scenes, their range. Between "
+        "two checkpoints quality is taken as linear in log time. Targets are stated with --target psnr=25; else they "
+        "are round numbers that the curves pass."
+    )
+    return [
+        Heading(3, "Time to quality"),
+        Table(tuple(head), tuple(rows)),
+        Paragraph(told),
+        *bullets(missing),
+    ]
+
+
+def _chosen_targets(configs: Sequence[Configuration], known: Sequence[str], headline: str) -> list[Target]:
+    chosen = []
+    for metric in ON_THE_CURVE:
+        for i in known:
+            if (Identity.parse(i).metric, Identity.parse(i).region) == (metric, headline):
+                found = [curve for c in configs for curve in curves(c, i).values()]
+                chosen += [Target(metric, value) for value in round_targets(found)]
+                break
+    return chosen
+
+
+def _time_cell(
+    found: Mapping[tuple[str, int], QualityCurve], target: float, identity: str, scenes: Sequence[str]
+) -> str:
+    times = times_to(target, found, scenes)
+    if not times:
+        return "—"
+    reached = sum(math.isfinite(value) for value in times.values())
+    if not reached:
+        metric = metric_of(identity)
+        values = [curve.best for (scene, _), curve in found.items() if scene in times]
+        best = max(values) if metric.higher_is_better else min(values)
+        return f"never (best {metric.text(best)})"
+    interval = median_interval(times, LEVEL)
+    shown = _seconds(interval.value)
+    if not math.isnan(interval.low):
+        shown += f" [{_seconds(interval.low, '')}, {_seconds(interval.high, '')}]"
+    return shown if reached == len(times) else f"{shown}, {reached} of {len(times)} scenes"
+
+
+def _area_table(configs: Sequence[Configuration], known: Sequence[str]) -> list[Block]:
+    scenes = shared_scenes(configs)
+    columns: list[tuple[str, float, float]] = []
+    for metric in ON_THE_CURVE:
+        for i in known:
+            if Identity.parse(i).metric != metric:
+                continue
+            found = [v for c in configs for (scene, _), v in curves(c, i).items() if scene in scenes]
+            start, end = common_window(found)
+            if math.isfinite(start):
+                columns.append((i, start, end))
+    if not columns:
+        return []
+    rows = []
+    for c in configs:
+        cells = [_area_cell(curves(c, i), i, start, end, scenes) for i, start, end in columns]
+        rows.append((c.label, *cells))
+    head = [f"{metric_of(i).title} {Identity.parse(i).region}" for i, _, _ in columns]
+    windows = sorted({f"{_seconds(start)} to {_seconds(end)}" for _, start, end in columns})
+    told = (
+        f"Mean of the metric over the logarithm of fitting time, from {'; '.join(windows)}: from the latest first "
+        "checkpoint of any run to the end of the longest fit; a finished fit keeps its last value. Mean over scenes."
+    )
+    return [Heading(3, "Area under the quality-time curve"), Table(("method", *head), tuple(rows)), Paragraph(told)]
+
+
+def _area_cell(
+    found: Mapping[tuple[str, int], QualityCurve], identity: str, start: float, end: float, scenes: Sequence[str]
+) -> str:
+    by_scene: dict[str, list[float]] = {}
+    for (scene, _), curve in found.items():
+        area = area_under_curve(curve, start, end)
+        if scene in scenes and math.isfinite(area):
+            by_scene.setdefault(scene, []).append(area)
+    return metric_of(identity).text(mean_interval(by_scene, LEVEL).value) if by_scene else "—"
+
+
+def _seconds(value: float, unit: str = " s") -> str:
+    return "never" if value == NEVER else f"{value:.3g}{unit}"
+
+
+def _interval(interval: Interval, form: str) -> str:
+    shown = form.format(interval.value)
+    if math.isfinite(interval.low):
+        shown += f" [{form.format(interval.low)}, {form.format(interval.high)}]"
+    return shown
+
+
+def _scored(interval: Interval, identity: str) -> str:
+    return metric_of(identity).text(interval.value)
+
+
+def _device_mb(run: RunResult) -> float:
+    stages = (run.record.get("ledger") or {}).get("stages", {})
+    return max((float(stage.get("peak_device_mb") or 0) for stage in stages.values()), default=0.0)

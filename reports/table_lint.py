@@ -1,0 +1,321 @@
+"""What is wrong with a table that somebody wrote: marks, arrows, units, decimals, claims within noise.
+
+Rows are ranked over the whole column; if a table has sections and its marks fit them better, inside each. Rows that
+only bound the others (the bench's calibration rows, "GT", "oracle") are not ranked. Of rows whose intervals overlap
+the best one's by the root of the sum of squares, all may be marked or none must be. A comment "ihbench lint: paired"
+before a table says that its marks come from paired differences, which intervals of single rows do not show: then
+a mark may be missing or stand within noise, but not on a wrong number.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from statistics import median
+
+from ihbench.reports.marks import ranks
+from ihbench.reports.metric_names import BOUNDED, HeadMetric
+from ihbench.reports.table_reading import Head, Number, ReadCell, ReadTable
+
+MARKED = {"best": "best", "second": "second-best"}
+FACTORS = (1000.0, 100.0)  # between units of one metric
+FAR = 10.0  # times the range of a column: no longer one of its numbers
+OTHER_UNIT = 30.0  # ratio of two columns' medians
+
+
+@dataclass(frozen=True, order=True)
+class Finding:
+    line: int
+    cell: str  # "OccFusion, ZJU-MoCap SSIM ↑"
+    what: str
+    expected: str
+
+    def __str__(self) -> str:
+        return f"{self.line}: {self.cell}: {self.what}; expected {self.expected}"
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A ranked number in a column."""
+
+    label: str
+    cell: ReadCell
+    number: Number
+    sections: tuple[int, int]  # by rules, by titles
+
+    @property
+    def value(self) -> float:
+        return self.number.value
+
+
+Section = Callable[[_Entry], int]  # the section a number is ranked in
+
+
+@dataclass(frozen=True)
+class _Column:
+    head: Head
+    metric: HeadMetric
+    entries: tuple[_Entry, ...]
+
+    def finding(self, entry: _Entry, what: str, expected: str) -> Finding:
+        return Finding(entry.cell.line, f"{entry.label}, {self.head.title}", what, expected)
+
+    def at_head(self, what: str, expected: str) -> Finding:
+        return Finding(self.head.cell.line, f"column {self.head.title}", what, expected)
+
+
+def lint(tables: Iterable[ReadTable]) -> list[Finding]:
+    """Everything wrong with these tables, by line. Columns whose head names no metric are left alone."""
+    return sorted(finding for table in tables for finding in set(_lint(table)))
+
+
+def unknown_heads(table: ReadTable) -> list[Head]:
+    """Heads of columns with marks that nobody can check: neither a known metric nor an arrow."""
+    return [
+        head
+        for k, head in enumerate(table.heads)
+        if head.metric is None and any(row.cells[k].mark for row in table.rows)
+    ]
+
+
+def _lint(table: ReadTable) -> Iterator[Finding]:
+    columns = _columns(table)
+    checked = []
+    for column in columns:
+        yield from _arrow(column)
+        odd = dict(_units(column))
+        yield from odd.values()
+        # a number in another unit has neither the column's decimals nor a rank in it
+        fitting = replace(column, entries=tuple(e for k, e in enumerate(column.entries) if k not in odd))
+        yield from _decimals(fitting)
+        checked.append(fitting)
+    yield from _same_metric(checked)
+    readings = [list(_marks(checked, section, table.paired)) for section in _readings(checked)]
+    yield from min(readings, key=len)  # the first of equals: the whole column
+
+
+def _readings(columns: Sequence[_Column]) -> Iterator[Section]:
+    """How rows may be meant to be ranked: all together; or in sections, if there are some of two rows or more, and
+    every one has a best number marked somewhere."""
+    sections: tuple[Section, ...] = (lambda entry: entry.sections[1], lambda entry: entry.sections[0])
+    yield lambda entry: 0
+    for section in sections:
+        rows: dict[int, set[int]] = {}
+        marked: set[int] = set()
+        for column in columns:
+            for entry in column.entries:
+                rows.setdefault(section(entry), set()).add(entry.cell.line)
+                marked |= {section(entry)} if entry.cell.mark == "best" else set()
+        if len(rows) > 1 and all(len(lines) > 1 for lines in rows.values()) and marked == set(rows):
+            yield section
+
+
+def _columns(table: ReadTable) -> list[_Column]:
+    found = []
+    for k, head in enumerate(table.heads):
+        if head.metric is None:
+            continue
+        entries = tuple(
+            _Entry(row.label, row.cells[k], number, (row.ruled_section, row.titled_section))
+            for row in table.rows
+            if row.ranked and (number := row.cells[k].number) is not None
+        )
+        if entries:
+            found.append(_Column(head, head.metric, entries))
+    return found
+
+
+# ---------------------------------------------------------------------------------------------- arrows and units
+
+
+def _arrow(column: _Column) -> Iterator[Finding]:
+    metric = column.metric
+    usual = metric.usual
+    if usual is None:
+        return
+    right = "↑" if usual else "↓"
+    better = "higher" if usual else "lower"
+    if not metric.arrow and not metric.cost:
+        yield column.at_head("missing arrow", f"{right} beside {metric.name.upper()}: {better} is better")
+    elif metric.arrow and metric.arrow != right:
+        yield column.at_head(f"wrong arrow {metric.arrow}", f"{right}: of {metric.name.upper()} {better} is better")
+
+
+def _units(column: _Column) -> Iterator[tuple[int, Finding]]:
+    """Cells in another unit than most of the column: another suffix, or off by a factor of 100 or 1000. With the
+    number of the entry."""
+    units = Counter(entry.number.unit for entry in column.entries)
+    most = max(units, key=lambda unit: (units[unit], unit))
+    for k, entry in enumerate(column.entries):
+        if entry.number.unit != most:
+            shown, wanted = (f"in {unit}" if unit else "without a unit" for unit in (entry.number.unit, most))
+            what = f"mixed units: {entry.number.shown} {shown}"
+            yield k, column.finding(entry, what, f"{wanted}, as most of the column")
+            continue
+        factor = _off_by(column, entry) if column.metric.name in BOUNDED else 1.0
+        if factor != 1:
+            times = f"{factor:g} times it" if factor > 1 else f"1/{1 / factor:g} of it"
+            what = f"mixed units: {entry.number.shown} does not fit the rest of the column"
+            yield k, column.finding(entry, what, times)
+
+
+def _off_by(column: _Column, entry: _Entry) -> float:
+    """The factor that would bring a number far from all the others among them; 1 if there is none."""
+    others = [abs(e.value) for e in column.entries if e is not entry and math.isfinite(e.value) and e.value]
+    value = abs(entry.value)
+    if len(others) < 2 or not value or not math.isfinite(value):
+        return 1.0
+    low, high = min(others), max(others)
+    if low / FAR <= value <= high * FAR:
+        return 1.0
+    fitting = (f for f in (*FACTORS, *(1 / f for f in FACTORS)) if low / 2 <= value * f <= high * 2)
+    return next(fitting, 1.0)
+
+
+def _decimals(column: _Column) -> Iterator[Finding]:
+    """One number of decimals in a column, or one number of significant digits."""
+    if column.metric.cost:
+        return
+    numbers = [entry.number for entry in column.entries if math.isfinite(entry.value)]
+    decimals = Counter(number.decimals for number in numbers)
+    if len(decimals) <= 1 or len({number.significant for number in numbers}) <= 1:
+        return
+    most = max(decimals, key=lambda d: (decimals[d], d))
+    for entry in column.entries:
+        if math.isfinite(entry.value) and entry.number.decimals != most:
+            yield column.finding(
+                entry,
+                f"inconsistent decimals: {entry.number.shown} has {entry.number.decimals}",
+                f"{most}, as most of the column",
+            )
+
+
+def _same_metric(columns: Sequence[_Column]) -> Iterator[Finding]:
+    """One metric in several columns of a table must be one quantity."""
+    for k, column in enumerate(columns):
+        first = next(c for c in columns if c.metric.name == column.metric.name)
+        if first is column or k == 0:
+            continue
+        a, b = (median(abs(e.value) for e in c.entries) for c in (first, column))
+        name = column.metric.name.upper()
+        if column.metric.name in BOUNDED and min(a, b) > 0 and max(a, b) / min(a, b) >= OTHER_UNIT:
+            yield column.at_head(
+                f"mixed units: {name} around {b:g} here and around {a:g} in {first.head.title}", "one unit in a table"
+            )
+        elif column.metric.scaled != first.metric.scaled:
+            here, there = ("scaled" if c.metric.scaled else "plain" for c in (column, first))
+            yield column.at_head(
+                f"mixed units: {name} is headed as {here} here and as {there} in {first.head.title}",
+                "one name for one unit",
+            )
+        elif column.metric.unit and first.metric.unit and column.metric.unit != first.metric.unit:
+            yield column.at_head(
+                f"mixed units: {name} in {column.metric.unit} here and in {first.metric.unit} in {first.head.title}",
+                "one unit in a table",
+            )
+
+
+# --------------------------------------------------------------------------------------------------------- marks
+
+
+def _marks(columns: Sequence[_Column], section: Section, paired: bool) -> Iterator[Finding]:
+    used = {entry.cell.mark for column in columns for entry in column.entries}
+    for column in columns:
+        parts: dict[int, list[_Entry]] = {}
+        for entry in column.entries:
+            parts.setdefault(section(entry), []).append(entry)
+        for entries in parts.values():
+            yield from _marks_of(column, entries, used, paired)
+
+
+def _marks_of(column: _Column, entries: Sequence[_Entry], used: set[str], paired: bool) -> Iterator[Finding]:
+    """Marks of rows that are ranked together."""
+    higher = column.metric.higher_is_better
+    found = ranks([entry.value for entry in entries], higher)
+    at = {rank: [e for e, r in zip(entries, found, strict=True) if r == rank] for rank in sorted(set(found))}
+    if len(at) < 2:  # one number, or all equal: nothing is better than something else
+        return
+    order = list(at)
+    best, next_best = at[order[0]], at[order[1]]
+    if column.metric.cost:  # often shown beside the quality and not ranked
+        used = {entry.cell.mark for entry in column.entries}
+    yield from _one_mark(column, entries, found, "best", best, "best" in used, paired)
+    # two best leave no second, and of two numbers the second is the last; who marks it all the same does no harm
+    strict = len(best) == 1 and len(entries) > 2
+    yield from _one_mark(column, entries, found, "second", next_best, strict and "second" in used, paired)
+
+
+def _one_mark(
+    column: _Column,
+    entries: Sequence[_Entry],
+    ranked: Sequence[int],
+    mark: str,
+    right: Sequence[_Entry],  # who deserves it by value
+    wanted: bool,  # whether somebody must have it
+    paired: bool,  # marks may be absent for reasons that the table does not show
+) -> Iterator[Finding]:
+    higher = column.metric.higher_is_better
+    marked = [entry for entry in entries if entry.cell.mark == mark]
+    worse = [e for e, rank in zip(entries, ranked, strict=True) if rank > ranked[_index(entries, right[0])]]
+    noisy = [e for e in worse if _within_noise(right[0].number, e.number, higher)]
+    names = " and ".join(f"{e.label} ({e.number.shown})" for e in right)
+    wrong = [
+        e for e in marked if not _among(e, right) and not (_among(e, noisy) and any(_among(r, marked) for r in right))
+    ]
+    for entry in wrong:
+        rank = ranked[_index(entries, entry)]
+        yield column.finding(
+            entry,
+            f"wrong {MARKED[mark]} mark: {entry.number.shown} is {_ordinal(rank)} of {len(entries)}",
+            f"the mark on {names}",
+        )
+    having = [entry for entry in right if _among(entry, marked)]
+    missing = [entry for entry in right if not _among(entry, marked)]
+    if having and missing:
+        for entry in missing:
+            yield column.finding(
+                entry,
+                f"tie: {entry.number.shown} equals the marked {having[0].label}",
+                f"the {MARKED[mark]} mark here too",
+            )
+    elif missing and not wrong and wanted and not paired and not noisy:
+        for entry in missing:
+            yield column.finding(
+                entry, f"missing {MARKED[mark]} mark", f"{entry.number.shown} marked as {MARKED[mark]}"
+            )
+    if paired or not having:
+        return
+    for entry in noisy:
+        # the best row is the second-best one's better, and a best that is marked too claims nothing over it
+        if not _among(entry, marked):
+            yield column.finding(
+                having[0],
+                f"claim within noise: {MARKED[mark]} mark, but {entry.label} ({entry.number.shown}) is not further "
+                "away than their intervals",
+                "no mark, or one on both",
+            )
+            return
+
+
+def _within_noise(better: Number, worse: Number, higher: bool) -> bool:
+    """Whether two numbers differ by no more than the root of the sum of squares of the intervals' facing halves."""
+    if not (better.has_interval and worse.has_interval):
+        return False
+    down, up = (better.value - better.low, worse.high - worse.value)
+    if not higher:
+        down, up = (better.high - better.value, worse.value - worse.low)
+    return abs(better.value - worse.value) <= math.hypot(max(down, 0.0), max(up, 0.0))
+
+
+def _index(entries: Sequence[_Entry], entry: _Entry) -> int:
+    return next(k for k, other in enumerate(entries) if other is entry)
+
+
+def _among(entry: _Entry, entries: Sequence[_Entry]) -> bool:
+    return any(other is entry for other in entries)
+
+
+def _ordinal(rank: int) -> str:
+    return f"{rank}{'th' if 10 <= rank % 100 <= 20 else {1: 'st', 2: 'nd', 3: 'rd'}.get(rank % 10, 'th')}"

@@ -1,0 +1,361 @@
+"""Tables as somebody wrote them, in LaTeX or Markdown, read back into heads, rows, numbers and marks."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from enum import IntFlag
+from pathlib import Path
+
+from ihbench.errors import BadInput
+from ihbench.reports.metric_names import HeadMetric, head_metric
+
+LARGEST_FILE = 4 * 2**20  # bytes
+NUM = r"[-+−]?(?:\d{1,3}(?:,\d{3})+(?:\.\d+)?|\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
+UNITS = r"%|dB|ms|sec|s|mins?|hours?|hrs?|h|[GM]i?B|FPS|fps|[kKMBG]|×|x|mm|cm|m"
+CELL = re.compile(
+    rf"""\s*[~≈<>≤≥]?\s*(?P<value>{NUM}|∞)\s*(?P<unit>{UNITS})?\s*
+    (?:±\s*(?P<half>{NUM})\s*
+      |\[\s*(?P<low>{NUM})\s*[,;]\s*(?P<high>{NUM})\s*\]
+      |\((?P<digits>\d+)\)
+      |\+\s*(?P<above>\d*\.?\d+)\s*[-−]\s*(?P<below>\d*\.?\d+))?
+    \s*(?P<unit2>{UNITS})?\s*(?:\([-+−↑↓][^)]*\))?\s*[†‡§¶*∗⋆]*\s*""",
+    re.VERBOSE,
+)  # fmt: skip
+NOTHING = re.compile(r"\s*(?:[-–—]+|n/?a|N/?A|/|✗|×|\?)?\s*")  # a cell without a number
+UNRANKED = re.compile(r"(gt|ground[- ]?truth|oracle|upper[- ]?bound)\b", re.IGNORECASE)
+PAIRED = "ihbench lint: paired"  # a comment before a table: its marks come from paired differences
+COLOURS = "red|orange|yellow|green|blue|cyan|teal|purple|magenta|gold|silver|bronze|pink|gray|grey"
+
+
+class Style(IntFlag):
+    """Of one character."""
+
+    PLAIN = 0
+    BEST = 1
+    SECOND = 2
+    THIRD = 4
+    ITALIC = 8
+
+
+Styled = list[tuple[str, Style]]  # characters with their styles
+
+
+@dataclass(frozen=True)
+class Number:
+    """The number in a cell."""
+
+    shown: str
+    value: float
+    decimals: int
+    significant: int
+    unit: str = ""
+    low: float = math.nan  # of its interval
+    high: float = math.nan
+
+    @property
+    def has_interval(self) -> bool:
+        return math.isfinite(self.low) and math.isfinite(self.high)
+
+
+@dataclass(frozen=True)
+class ReadCell:
+    text: str
+    line: int
+    number: Number | None = None
+    mark: str = ""  # best, second, third
+    italic: bool = False
+    colours: tuple[str, ...] = ()
+
+    @property
+    def empty(self) -> bool:
+        return NOTHING.fullmatch(self.text) is not None
+
+
+@dataclass(frozen=True)
+class GridRow:
+    cells: tuple[ReadCell, ...]
+    line: int
+    ruled: bool = False  # a full rule stands above it
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A table before anybody knows which of its rows are heads. Cells that span columns are repeated."""
+
+    line: int
+    rows: tuple[GridRow, ...]
+    caption: str = ""
+    paired: bool = False
+    heads: int = 0  # rows that the syntax makes heads
+
+
+@dataclass(frozen=True)
+class Head:
+    """A column's head."""
+
+    cell: ReadCell  # the one that names the metric
+    title: str  # such as "ZJU-MoCap SSIM ↑"
+    metric: HeadMetric | None
+
+
+@dataclass(frozen=True)
+class ReadRow:
+    label: str
+    cells: tuple[ReadCell, ...]
+    line: int
+    ruled_section: int = 0  # counted by full rules
+    titled_section: int = 0  # counted by rows that are a title
+
+    @property
+    def ranked(self) -> bool:
+        from ihbench.calibration import ROWS
+
+        return self.label not in ROWS and UNRANKED.match(self.label) is None
+
+
+@dataclass(frozen=True)
+class ReadTable:
+    line: int
+    heads: tuple[Head, ...]
+    rows: tuple[ReadRow, ...]
+    paired: bool = False
+
+
+@dataclass
+class Reading:
+    tables: list[ReadTable] = field(default_factory=list)
+    notes: list[tuple[int, str]] = field(default_factory=list)  # line, what was not understood
+
+
+def read_tables(path: Path) -> Reading:
+    """Every table of a .tex or .md file.
+
+    Raises `BadInput` for a file that is missing, too large, not text, of another kind, or without any table.
+    """
+    from ihbench.reports.latex_reading import latex_grids
+    from ihbench.reports.markdown_reading import markdown_grids
+
+    readers = {".tex": latex_grids, ".md": markdown_grids, ".markdown": markdown_grids}
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        raise BadInput(f"{path}: expected a .tex or .md file")
+    try:
+        if path.stat().st_size > LARGEST_FILE:
+            raise BadInput(f"{path}: larger than {LARGEST_FILE // 2**20} MiB, which no table is")
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise BadInput(f"{path}: not UTF-8 text (byte {error.start}); save it as UTF-8") from error
+    except OSError as error:
+        raise BadInput(f"{path}: cannot be read ({error.strerror})") from error
+    grids, notes = reader(text)
+    if not grids:
+        told = f" ({notes[0][1]}, line {notes[0][0]})" if notes else ""
+        raise BadInput(f"{path}: no table in it{told}; expected a tabular environment or a Markdown table")
+    return Reading([table for grid in grids for table in tables_of(grid)], notes)
+
+
+def blanked(text: str, opening: str, closing: str) -> str:
+    """The text with everything from each opening to its closing turned into spaces, so that lines and places stay."""
+    parts, at = [], 0
+    while (begin := text.find(opening, at)) >= 0 and (end := text.find(closing, begin + len(opening))) >= 0:
+        end += len(closing)
+        parts += [text[at:begin], re.sub(r"[^\n]", " ", text[begin:end])]
+        at = end
+    return "".join([*parts, text[at:]])
+
+
+# -------------------------------------------------------------------------------------------------------- cells
+
+
+def read_cell(styled: Styled, line: int, colours: Sequence[str] = ()) -> ReadCell:
+    """A cell from its characters: its number, and the mark on that number."""
+    text = "".join(character for character, _ in styled)
+    found = CELL.fullmatch(text)
+    if found is None:
+        return ReadCell(" ".join(text.split()), line, colours=tuple(colours))
+    style = styled[found.start("value")][1]
+    mark = next((word for bit, word in MARKS if style & bit), "")
+    number = _number(found)
+    return ReadCell(" ".join(text.split()), line, number, mark, bool(style & Style.ITALIC), tuple(colours))
+
+
+MARKS = ((Style.BEST, "best"), (Style.SECOND, "second"), (Style.THIRD, "third"))
+
+
+def _number(found: re.Match[str]) -> Number:
+    shown = found["value"].replace("−", "-")
+    plain = shown.replace(",", "")
+    value = math.inf if plain == "∞" else float(plain)
+    mantissa = re.split("[eE]", plain)[0]
+    decimals = len(mantissa.partition(".")[2])
+    significant = len(mantissa.lstrip("+-0.").replace(".", ""))
+    unit = found["unit"] or found["unit2"] or ""
+    low = high = math.nan
+    if found["half"] is not None:
+        half = abs(_float(found["half"]))
+        low, high = value - half, value + half
+    elif found["low"] is not None:
+        low, high = _float(found["low"]), _float(found["high"])
+    elif found["digits"] is not None:  # 24.65(12) is 24.65 ± 0.12
+        half = int(found["digits"]) * 10.0**-decimals
+        low, high = value - half, value + half
+    elif found["above"] is not None:
+        low, high = value - _float(found["below"]), value + _float(found["above"])
+    return Number(shown, value, decimals, significant, unit, low, high)
+
+
+def _float(text: str) -> float:
+    return float(text.replace(",", "").replace("−", "-"))
+
+
+# ------------------------------------------------------------------------------------------- from grids to tables
+
+
+def tables_of(grid: Grid) -> list[ReadTable]:
+    """The tables in a grid: a row of metric names after rows of numbers begins another one."""
+    rows = _marked_by_colour(grid)
+    width = max((len(row.cells) for row in rows), default=0)
+    found: list[ReadTable] = []
+    heads: list[GridRow] = []
+    body: list[tuple[GridRow, int, int]] = []
+    first, ruled, titled = _leading_heads(rows, grid.heads), 0, 0
+    for k, row in enumerate(rows):
+        ruled += row.ruled
+        if k < first or (_is_head(row) and (body or not _has_numbers(row))):
+            if body:
+                found += _table(grid, heads, body, width)
+                heads, body = [], []
+            heads.append(row)
+        elif _title(row) is not None:
+            titled += 1
+        elif any(cell.text for cell in row.cells):
+            body.append((row, ruled, titled))
+    return [*found, *_table(grid, heads, body, width)]
+
+
+def _leading_heads(rows: Sequence[GridRow], given: int) -> int:
+    """How many rows at the top are heads: those above the first full rule, if they look like it."""
+    if given:
+        return given
+    end = next((k for k, row in enumerate(rows) if k and row.ruled), 0)
+    above = rows[:end]
+    if any(_is_head(row) for row in above) or not any(_has_numbers(row) for row in above):
+        return end
+    return 0
+
+
+def _has_numbers(row: GridRow) -> bool:
+    return any(cell.number for cell in row.cells[1:])
+
+
+def _is_head(row: GridRow) -> bool:
+    """Metric names beside the first column, and no numbers."""
+    return not _has_numbers(row) and any(head_metric(cell.text) for cell in row.cells[1:])
+
+
+def _title(row: GridRow) -> str | None:
+    """The text of a row that has only one, at its start or over all of it."""
+    if any(cell.number for cell in row.cells):
+        return None
+    texts = {cell.text for cell in row.cells if cell.text}
+    first = row.cells[0].text if row.cells else ""
+    return first if first and texts == {first} and len(row.cells) > 1 else None
+
+
+def _table(grid: Grid, heads: list[GridRow], body: list[tuple[GridRow, int, int]], width: int) -> list[ReadTable]:
+    if not body:
+        return []
+    columns = [_head(heads, k, grid.line) for k in range(width)]
+    labels = _label_columns(columns, body)
+    names = _names([row for row, _, _ in body], labels)
+    rows = [
+        ReadRow(
+            name,
+            tuple([*row.cells, *[ReadCell("", row.line)] * (width - len(row.cells))][labels:]),
+            row.line,
+            ruled,
+            titled,
+        )
+        for name, (row, ruled, titled) in zip(names, body, strict=True)
+    ]
+    table = ReadTable(grid.line, tuple(columns[labels:]), tuple(rows), grid.paired)
+    return [_upright(table)]
+
+
+def _names(rows: Sequence[GridRow], labels: int) -> list[str]:
+    """What rows are called: by the first column, if that tells them apart, else by all columns before the numbers."""
+    first = [row.cells[0].text for row in rows]
+    if len({*first}) == len(rows) and all(first):
+        return first
+    joined = [" / ".join(dict.fromkeys(c.text for c in row.cells[:labels] if c.text)) for row in rows]
+    return [name or f"row {k + 1}" for k, name in enumerate(joined)]
+
+
+def _label_columns(columns: Sequence[Head], body: Sequence[tuple[GridRow, int, int]]) -> int:
+    """How many columns at the left name a row: at least one, up to the first with a metric or a number."""
+    for k, head in enumerate(columns[1:], 1):
+        if head.metric or any(k < len(row.cells) and row.cells[k].number for row, _, _ in body):
+            return k
+    return 1
+
+
+def _head(heads: Sequence[GridRow], k: int, line: int) -> Head:
+    parts = [row.cells[k] for row in heads if k < len(row.cells) and row.cells[k].text]
+    title = " ".join(dict.fromkeys(cell.text for cell in parts))
+    for cell in reversed(parts):
+        metric = head_metric(cell.text)
+        if metric is not None:
+            # a group's head may hold the arrow of all its columns
+            arrow = metric.arrow or next((m.arrow for c in parts if (m := head_metric(c.text)) and m.arrow), "")
+            return Head(cell, title, replace(metric, arrow=arrow))
+    return Head(parts[-1] if parts else ReadCell("", line), title, None)
+
+
+def _upright(table: ReadTable) -> ReadTable:
+    """The table with metrics as columns: turned over if they are its rows."""
+    if any(head.metric for head in table.heads):
+        return table
+    metrics = [head_metric(row.label) for row in table.rows]
+    if not any(metrics):
+        return table
+    heads = tuple(
+        Head(ReadCell(row.label, row.line), row.label, metric)
+        for row, metric in zip(table.rows, metrics, strict=True)
+    )
+    rows = tuple(
+        ReadRow(head.title or f"column {k + 2}", tuple(row.cells[k] for row in table.rows), table.line)
+        for k, head in enumerate(table.heads)
+    )
+    return ReadTable(table.line, heads, rows, table.paired)
+
+
+# ----------------------------------------------------------------------------------------- marks by colour or slant
+
+
+def _marked_by_colour(grid: Grid) -> list[GridRow]:
+    """The rows with marks for colours and italics, where the caption or custom makes them marks.
+
+    A caption that says "best" and names colours gives their order. Without one, red, orange and yellow cells are the
+    first, second and third of many papers on radiance fields. Italics mark where the caption says so.
+    """
+    caption = grid.caption.lower()
+    named = list(dict.fromkeys(re.findall(rf"\b({COLOURS})\b", caption))) if "best" in caption else []
+    order = named or ["red", "orange", "yellow"]
+    slanted = "italic" in caption
+
+    def marked(cell: ReadCell) -> ReadCell:
+        if cell.number is None or cell.mark:
+            return cell
+        for colour in cell.colours:
+            kind, _, name = colour.partition(":")
+            if kind == "text" and not named:
+                continue  # coloured words are often just emphasis
+            for rank, wanted in enumerate(order[:3]):
+                if wanted in name or ("first", "second", "third")[rank] in name:
+                    return replace(cell, mark=("best", "second", "third")[rank])
+        return replace(cell, mark="second") if slanted and cell.italic else cell
+
+    return [replace(row, cells=tuple(marked(cell) for cell in row.cells)) for row in grid.rows]

@@ -1,0 +1,225 @@
+"""`ihbench ablate`: the runs that a ladder means, what they share, what a failed one leaves of the others."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from types import SimpleNamespace
+
+import pytest
+
+from ihbench import cells as cells_module
+from ihbench import registry
+from ihbench.ablation import Comparison, Ladder, Rung, configured, grid, set_on_all, shared_part
+from ihbench.atomic import read_json
+from ihbench.cells import Cell, run_cells
+from ihbench.commands import ablate as ablate_command
+from ihbench.commands.ablate import AblateOptions
+from ihbench.config_fields import flat
+from ihbench.errors import BadInput
+from ihbench.methods.inpainthuman.config import PROFILES, QUICK
+from ihbench.progress import Progress
+from ihbench.results import read_result
+from ihbench.store import RunFolder
+from tests.conftest import SCENES
+
+TINY = ["texels=32", "levels=16", "decoder_width=32", "position_map=16"]
+
+
+def ablate(bench, *words, on=("inpaint.on=off",)):
+    return bench(
+        *("ablate", "--protocol", bench.protocol, "--runs", bench.runs, "--workers", "0"),
+        *("--set", *TINY, *on), *words,
+    )  # fmt: skip
+
+
+# ----------------------------------------------------------------------------------------------------- ladders
+
+
+def test_a_grid_is_every_combination_and_compares_with_the_first():
+    ladder = grid(QUICK, {"levels": [(64,), (64, 128)], "inpaint.on": [True, False]})
+    assert [dict(rung.switches) for rung in ladder.rungs] == [
+        {"levels": levels, "inpaint.on": on} for levels in ((64,), (64, 128)) for on in (True, False)
+    ]
+    assert {c.without for c in ladder.comparisons} == {"levels=64, inpaint.on=True"}
+    assert len(ladder.comparisons) == 3
+    with pytest.raises(BadInput, match="no such switch"):
+        grid(QUICK, {"level": [1]})
+
+
+def test_a_ladder_compares_its_own_rungs_only():
+    with pytest.raises(ValueError, match="does not have"):
+        Ladder("x", (Rung("a"),), (Comparison("what", "a", "b"),))
+    with pytest.raises(ValueError, match="different names"):
+        Ladder("x", (Rung("a"), Rung("a")), ())
+
+
+def test_what_is_set_on_all_does_not_overrule_a_rung():
+    ladder = set_on_all(Ladder("x", (Rung("a"), Rung("b", {"steps": 7})), ()), {"steps": 3, "texels": 32})
+    assert [configured(rung, QUICK).steps for rung in ladder.rungs] == [3, 7]
+    assert {configured(rung, QUICK).texels for rung in ladder.rungs} == {32}
+
+
+@pytest.mark.parametrize("name", registry.load("ladder", "inpainthuman"))
+@pytest.mark.parametrize("profile", PROFILES)
+def test_every_rung_of_the_method_is_a_configuration_of_its_own(name, profile):
+    ladder = registry.load("ladder", "inpainthuman")[name]
+    found = [configured(rung, PROFILES[profile]) for rung in ladder.rungs]
+    keys = {(tuple(flat(config).items()), rung.keep) for config, rung in zip(found, ladder.rungs, strict=True)}
+    assert len(keys) == len(found)
+
+
+def test_the_papers_rungs_share_their_first_stage_by_the_maps_they_have():
+    ladder = registry.load("ladder", "inpainthuman")["table2"]
+    free = registry.load("config", "inpainthuman").SHARED_STATES["stage1"]
+    keys = {rung.name: shared_part(configured(rung, QUICK), free) for rung in ladder.rungs}
+    assert len(set(keys.values())) == 2
+    assert keys["one level"] == keys["one level, diffusion"] != keys["MS"] == keys["MS + TI + SG"]
+
+
+# ----------------------------------------------------------------------------------------------------- the command
+
+
+def test_two_rungs_on_two_scenes_from_the_runs_to_the_table(bench, tmp_path, monkeypatch):
+    """One test, because its four runs are dear: the numbers, the JSON, the second call, a cell that fails."""
+    out = tmp_path / "out"
+    words = ("--vary", "steps=2:6", "--seed", "0", "--scene", *SCENES, "--out", out)
+    outcome = ablate(bench, *words)
+    assert outcome.status == 0, outcome.err
+    the_table_holds_the_means_of_its_runs(bench, outcome, out)
+    assert json.loads(ablate(bench, *words, "--json").out) == read_json(out / "ablation.json")
+    what_is_finished_is_not_done_again(bench, words, outcome, monkeypatch)
+    a_failed_cell_does_not_take_the_others_along(bench, monkeypatch)
+
+
+def the_table_holds_the_means_of_its_runs(bench, outcome, out):
+    numbers = read_json(out / "ablation.json")
+    (table,) = numbers["tables"]
+    assert list(table["rungs"]) == ["steps=2", "steps=6"]
+    runs = [read_result(folder) for folder in bench.folders()]
+    assert len(runs) == 4
+    for steps in (2, 6):
+        own = [run for run in runs if run.identity["config"]["steps"] == steps]
+        assert {run.scene for run in own} == set(SCENES)
+        for identity, score in table["rungs"][f"steps={steps}"]["scores"].items():
+            expected = sum(run.rows["inpainthuman"][identity].value for run in own) / 2
+            assert score["mean"] == pytest.approx(expected)
+    (comparison,) = table["comparisons"]
+    first = next(iter(comparison["scores"]))
+    before, after = (table["rungs"][f"steps={s}"]["scores"][first]["mean"] for s in (2, 6))
+    assert comparison["scores"][first]["mean"] == pytest.approx(after - before)
+    assert outcome.out == (out / "ablation.md").read_text(encoding="utf-8") + "\n"
+    assert "stand-in" in outcome.out
+
+
+def what_is_finished_is_not_done_again(bench, words, before, monkeypatch):
+    with monkeypatch.context() as planted:
+        method = registry.load("method", "inpainthuman")
+        planted.setattr(method, "fit", lambda *_, **__: pytest.fail("fitted again"))
+        again = ablate(bench, *words)
+    assert again.status == 0
+    assert again.out == before.out
+
+
+def a_failed_cell_does_not_take_the_others_along(bench, monkeypatch):
+    method = registry.load("method", "inpainthuman")
+    honest = method.fit
+
+    def fit(self, training, **more):
+        if training.name == SCENES[0]:
+            raise RuntimeError("a planted fault")
+        return honest(self, training, **more)
+
+    monkeypatch.setattr(method, "fit", fit)
+    outcome = ablate(bench, "--vary", "steps=2:3", "--seed", "0", "--scene", *SCENES)
+    assert outcome.status == 1
+    assert "| steps=3 | 1 | 1 of 2 |" in outcome.out
+    assert f"{SCENES[0]} seed 0, steps=3: failed (RuntimeError: a planted fault" in outcome.out
+    assert "| steps=2 | 2 | 2 |" in outcome.out
+
+
+def test_a_rung_can_keep_what_the_plan_would_leave_out(bench):
+    """And shares nothing with one that does not keep it."""
+    ladder = registry.load("ladder", "inpainthuman")["plan"]
+    chosen = AblateOptions(protocol=str(bench.protocol), scene=(SCENES[0],), seed=(0, 1), runs=bench.runs)
+    with bench.in_its_world():
+        cells = ablate_command._cells(chosen, ladder, Progress.silent())
+    assert [rung for rung, _ in cells] == ["everything", "planned"] * 2
+    assert [cell.request.keep for _, cell in cells] == [("all",), ()] * 2
+    assert [cell.request.seed for _, cell in cells] == [0, 0, 1, 1]
+    assert all(cell.request.share and cell.after is None for _, cell in cells)
+
+
+def test_rungs_that_begin_alike_share_their_first_stage_and_its_seconds(bench):
+    """With and without sharing the scores are the same to the last bit."""
+    from dataclasses import replace
+
+    words = ("--vary", "refine.steps=0:4", "--seed", "0", "--scene", SCENES[0])
+    painted = ("steps=6", "inpaint.filler=mirror", "inpaint.key_views=2")
+    apart = replace(bench, runs=bench.runs.parent / "apart")
+    assert ablate(bench, *words, on=painted).status == 0
+    alone = ("--vary", "refine.steps=4", *words[2:])
+    assert ablate(apart, *alone, "--no-share", on=painted).status == 0
+    mine, other = bench.folders()[1], apart.folders()[0]
+    assert (mine / "scores.jsonl").read_bytes() == (other / "scores.jsonl").read_bytes()
+    steps = [[point["step"] for point in RunFolder.open(folder).curve()] for folder in (mine, other)]
+    assert steps[0][-1] == steps[1][-1]
+    events = [{e["kind"]: e["data"] for e in read_json(f / "run.json")["ledger"]["events"]} for f in bench.folders()]
+    assert "shared" not in events[0]
+    assert events[1]["shared"] == {"state": "stage1", "run": read_json(bench.folders()[0] / "run.json")["digest"]}
+    stages = [read_json(folder / "run.json")["ledger"]["stages"] for folder in bench.folders()]
+    assert stages[1]["fit/stage1"]["seconds"] >= 0.5 * stages[0]["fit/stage1"]["seconds"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--vary", "levls=64"), "levls=64: no such switch of inpainthuman: did you mean 'levels'"),
+        (("--vary", "steps=many"), "steps"),
+        (("--vary", "inpaint.on=perhaps"), "inpaint.on=perhaps: expected on or off"),
+        (("--vary", "steps"), "--vary steps: expected NAME=VALUE"),
+        (("--vary", "steps=1", "--ladder", "levels"), "--ladder levels with --vary: expected one of the two"),
+        (("--ladder", "tabel2"), "--ladder tabel2: did you mean 'table2'"),
+        (("--ladder", "levels", "--seed", "-1"), "--seed -1"),
+        (("--ladder", "levels", "--workers", "-1"), "--workers -1: expected 0 or more"),
+    ],
+)
+def test_bad_words_are_refused_in_one_line(bench, words, said):
+    outcome = bench("ablate", "--protocol", bench.protocol, "--runs", bench.runs, *words)
+    assert outcome.status == 2
+    assert said in outcome.err
+    assert not bench.runs.exists()
+
+
+# ----------------------------------------------------------------------------------------------------- processes
+
+
+def a_child(connection, request, source, scene, threads):
+    """What a process does in these tests: `scene` says it."""
+    assert os.environ["OMP_NUM_THREADS"] == str(threads)
+    if scene == "killed":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if scene == "silent":
+        os._exit(3)
+    connection.send((None, f"said {scene} {request}"))
+
+
+def test_every_process_has_an_outcome_and_cells_wait_for_those_they_follow(monkeypatch):
+    monkeypatch.setattr(cells_module, "_child", a_child)
+    asked = [("killed", None), ("silent", None), ("b", 0)]
+    made = [Cell(scene, k, None, scene, after) for k, (scene, after) in enumerate(asked)]  # pyright: ignore
+    order = []
+    progress = SimpleNamespace(task=Progress.silent().task, say=order.append)
+    outcomes = run_cells(made, 2, 3, progress)  # pyright: ignore
+    assert [o.problem for o in outcomes] == [
+        "its process was killed by signal 9", "its process ended with status 3", "said b 2",
+    ]  # fmt: skip
+    assert not any(o.done for o in outcomes)
+    names = [line.partition(":")[0] for line in order]
+    assert names.index("b") > names.index("killed")
+
+
+def test_a_cell_cannot_wait_for_a_later_one():
+    with pytest.raises(ValueError, match="earlier cell"):
+        run_cells([Cell("a", None, None, "a", 0)], 1, 1, Progress.silent())  # pyright: ignore

@@ -1,0 +1,118 @@
+"""The paper's numbers as data: complete, as printed, and refused when damaged."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+
+import pytest
+
+from ihbench import registry
+from ihbench.errors import BadInput
+from ihbench.reports.paper_numbers import Digits, paper_table
+
+
+def row(table, name):
+    (found,) = [row for row in table.rows if row.name == name]
+    return found
+
+
+def test_table1_is_the_papers():
+    table = paper_table("table1")
+    assert [column.group for column in table.columns] == ["ZJU-MoCap"] * 3 + ["OcMotion"] * 3
+    assert len(table.rows) == 10
+    assert [cell.text for cell in row(table, "OccNeRF").cells] == [
+        "22.40",
+        "0.9562",
+        "43.01",
+        "15.71",
+        "0.8230",
+        "82.90",
+    ]
+    assert [cell.text for cell in row(table, "HumanNeRF").cells][2:] == ["--", "9.79", "0.7203", "189.1"]
+    # column sums, from the paper's LaTeX: one wrong digit anywhere shows
+    sums = [sum(c.value for r in table.rows if not math.isnan((c := r.cells[k]).value)) for k in range(6)]
+    assert sums == pytest.approx([194.71, 8.557, 369.15, 107.81, 5.863, 720.17])
+    absent = [(r.name, k) for r in table.rows for k, c in enumerate(r.cells) if c.status == "absent"]
+    assert len(absent) == 13
+
+
+def test_table2_is_the_papers():
+    table = paper_table("table2")
+    assert [[cell.text for cell in row.cells] for row in table.rows] == [
+        ["20.05", "0.9501", "61.47"],
+        ["22.35", "0.9603", "55.92"],
+        ["24.27", "0.9649", "38.53"],
+        ["24.31", "0.9701", "37.42"],
+    ]
+    assert [row.components for row in table.rows] == [(k > 0, k > 1, k > 2) for k in range(4)]
+
+
+def test_statuses_say_who_reports_what():
+    table = paper_table("table1")
+    assert {cell.status for cell in row(table, "InpaintHuman").cells} == {"reported"}
+    assert {cell.status for cell in row(table, "GTU").cells} == {"quoted"}
+    assert row(table, "GaussianAvatar").cells[1].status == "unreliable"
+
+
+def test_numbers_that_are_written_elsewhere_too_are_the_same():
+    card = tomllib.loads(
+        (registry.package_folder("method", "inpainthuman") / "card.toml").read_text(encoding="utf-8")
+    )
+    own = [cell.value for cell in row(paper_table("table1"), "InpaintHuman").cells]
+    assert [*card["reported"]["zju_mocap"].values(), *card["reported"]["ocmotion"].values()] == own
+    rows = [[cell.value for cell in row.cells] for row in paper_table("table2").rows]
+    rungs = [rung.paper for rung in registry.load("ladder", "inpainthuman")["table2"].rungs if rung.paper]
+    assert rungs
+    assert all([paper["psnr"], paper["ssim"], paper["lpips"]] in rows for paper in rungs)
+
+
+def test_columns_have_arrows_and_units():
+    assert [column.title for column in paper_table("table2").columns] == [
+        "PSNR ↑ (dB)",
+        "SSIM ↑",
+        "LPIPS* ↓ (× 1000)",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"), [(31.634, "31.63"), (189.06, "189.1"), (9.996, "9.996"), (99.996, "100.0"), (0.0, "0.000")]
+)
+def test_significant_digits_are_those_of_the_papers_columns(value, shown):
+    assert f"{value:.{Digits(significant=4).decimals_of(value)}f}" == shown
+
+
+def damaged(tmp_path, old, new):
+    from importlib.resources import files
+
+    text = (files("ihbench.reports") / "paper_tables.toml").read_text(encoding="utf-8")
+    assert old in text
+    file = tmp_path / "mine.toml"
+    file.write_text(text.replace(old, new, 1), encoding="utf-8")
+    return file
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ('"20.67", ', "", "expected 6 cells"),
+        ('"20.67"', '"2o.67"', "could not convert"),
+        ('"20.67"', '"nan"', "is no number"),
+        ('footnotes = { 1 = ["odd_ssim"] }', 'footnotes = { 1 = ["odd"] }', "unknown footnote 'odd'"),
+        ('status = "reported"', 'status = "seen"', "status 'seen'"),
+        ('printed = "second"', 'printed = "2nd"', "printed '2nd'"),
+        ('head = "Method"', "", "KeyError 'head'"),
+        ("[digits]", "[digits", "cannot be read"),
+    ],
+)
+def test_a_damaged_file_is_refused_in_one_line(tmp_path, old, new, told):
+    file = damaged(tmp_path, old, new)
+    with pytest.raises(BadInput, match=str(file)) as refused:
+        paper_table("table1", file)
+    assert told in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_an_unknown_table_is_answered_with_the_known_ones():
+    with pytest.raises(BadInput, match="no table 'table3'; known: table1, table2"):
+        paper_table("table3")

@@ -1,0 +1,243 @@
+"""The report's sections on run time, and its figures: what they say, and that nothing odd brings them down."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+
+import pytest
+
+from ihbench.quality_time import Target
+from ihbench.reports.configurations import configurations, sweeps
+from ihbench.reports.figures import draw
+from ihbench.reports.markdown import markdown, write
+from ihbench.reports.run_time import across_sizes_section, run_time_section, work_points
+from tests.reports.made_up_runs import FLIP, PSNR, made_up, sweep
+
+IDENTITIES = [PSNR.format("body"), FLIP.format("body")]
+
+
+def section(runs, *targets):
+    return markdown(run_time_section(runs, IDENTITIES, "body", targets))
+
+
+def cells(text, label, title="Error against run time"):
+    """The row's cells by column head, in the table below a title."""
+    part = text.split(f"### {title}\n", 1)[1].split("###", 1)[0]
+    lines = [[c.strip() for c in line.split("|")[1:-1]] for line in part.splitlines() if line[:1] == "|"]
+    (found,) = [row for row in lines if row[0] == label]
+    return dict(zip(lines[0], found, strict=True))
+
+
+# --------------------------------------------------------------------------------------------------------- the costs
+
+
+def test_seconds_are_means_over_scenes_with_an_interval_and_one_scene_takes_its_repeats(tmp_path):
+    two = [
+        made_up(tmp_path, s, fit=f, seed=k) for s, fits in (("a", (10, 20)), ("b", (30,))) for k, f in enumerate(fits)
+    ]
+    found = cells(section(two), "ours")
+    assert found["fit s [95%]"].startswith("22.5 [")  # (15 + 30) / 2
+    assert found["runs"] == "3"
+    repeats = [made_up(tmp_path, fit=f, seed=k) for k, f in enumerate((38, 40, 42))]
+    assert re.fullmatch(r"40 \[35(\.\d)?, 45(\.\d)?\]", cells(section(repeats), "ours")["fit s [95%]"])
+    assert cells(section(repeats[:1]), "ours")["fit s"] == "38"
+
+
+def test_the_pareto_marks_are_those_of_the_numbers_in_the_table(tmp_path):
+    text = section(sweep(tmp_path))
+    marks = {
+        label: cells(text, label)["Pareto"]
+        for label in ("ours (steps=50)", "ours", "ours (steps=200)", "ours (texels=8)", "ours (texels=32)", "theirs")
+    }
+    assert marks == {
+        "ours (steps=50)": "PSNR, FLIP",
+        "ours": "PSNR, FLIP",
+        "ours (steps=200)": "PSNR, FLIP",
+        "ours (texels=8)": "—",
+        "ours (texels=32)": "—",
+        "theirs": "—",
+    }
+
+
+def test_rows_are_compared_only_over_scenes_that_all_have(tmp_path):
+    runs = [made_up(tmp_path, s, psnr=p) for s, p in (("a", 20.0), ("b", 30.0))]
+    runs.append(made_up(tmp_path, "a", "theirs", psnr=21.0))
+    text = section(runs)
+    assert cells(text, "ours")["PSNR ↑"] == "20.00"
+    assert "1 scene that all rows have" in text
+    apart = section([made_up(tmp_path, "a"), made_up(tmp_path, "b", "theirs")])
+    assert "no scene in common" in apart
+
+
+def test_seconds_of_two_machines_are_never_one_mean(tmp_path):
+    runs = [made_up(tmp_path, "a", fit=10), made_up(tmp_path, "a", seed=1, fit=90, machine={"cpu": "a slower one"})]
+    text = section(runs)
+    assert cells(text, "ours on A")["fit s"] == "10"
+    assert cells(text, "ours on B")["fit s"] == "90"
+    assert "machine B: a slower one, 4 cores" in text
+
+
+def test_unstable_is_said_when_repeats_or_the_load_say_so_and_only_then(tmp_path):
+    calm = [made_up(tmp_path, seed=k, fit=f) for k, f in enumerate((40, 44))]
+    assert "unstable" not in section(calm)
+    apart = [made_up(tmp_path, seed=k, fit=f) for k, f in enumerate((40, 60))]
+    assert "unstable seconds: repeats 40% of their median apart: ours" in section(apart)
+    busy = [made_up(tmp_path, machine={"load_average": [9.0, 1.0, 1.0]})]
+    assert "unstable seconds: 1 of 1 runs on a busy machine (load up to 2.2 per core): ours" in section(busy)
+
+
+def test_runs_without_a_fit_time_have_no_section(tmp_path):
+    scored = made_up(tmp_path)
+    scored.record["about"]["fit_seconds"] = None
+    assert section([scored]) == "\n"
+
+
+# ---------------------------------------------------------------------------------------------------- time to quality
+
+
+def test_times_are_medians_over_scenes_and_never_is_an_outcome(tmp_path):
+    quick, slow = ((2.0, 10.0), (8.0, 30.0)), ((2.0, 10.0), (8.0, 14.0))
+    runs = [made_up(tmp_path, s, curve=c) for s, c in (("a", quick), ("b", quick), ("c", slow))]
+    text = section(runs, Target("psnr", 20.0), Target("psnr", 31.0), Target("psnr", 12.0, "hidden"))
+    found = cells(text, "ours", "Time to quality")
+    assert found["PSNR ≥ 20 dB"] == "4 s [4, never], 2 of 3 scenes"
+    assert found["PSNR ≥ 31 dB"] == "never (best 30.00)"
+    assert found["PSNR hidden ≥ 12 dB"].startswith("2.3 s [2.3, 4]")
+
+
+def test_a_metric_that_is_not_on_the_curve_is_named(tmp_path):
+    assert "no curve of lpips in body" in section([made_up(tmp_path)], Target("lpips", 0.1))
+
+
+def test_without_targets_round_ones_are_taken_that_the_curves_pass(tmp_path):
+    head = section([made_up(tmp_path)]).split("### Time to quality")[1].splitlines()[2]
+    targets = [float(x) for x in re.findall(r"PSNR ≥ ([\d.]+) dB", head)]
+    assert len(targets) == 3
+    assert all(15 <= t <= 23 for t in targets)
+
+
+def test_the_area_is_over_one_window_for_all_rows(tmp_path):
+    level = [made_up(tmp_path, curve=((2.0, 20.0), (32.0, 20.0)))]
+    level.append(made_up(tmp_path, "a", "theirs", curve=((4.0, 10.0), (16.0, 20.0))))
+    text = section(level)
+    title = "Area under the quality-time curve"
+    assert cells(text, "ours", title)["PSNR body"] == "20.00"
+    assert cells(text, "theirs", title)["PSNR body"] == "16.67"  # from 4 s to 32 s: 10 → 20 over two octaves, then 20
+    assert "from 4 s to 32 s" in text
+
+
+# ----------------------------------------------------------------------------------------------------- what is odd
+
+
+ODD = [
+    {"curve": None},
+    {"curve": ()},
+    {"curve": ((5.0, math.nan),)},
+    {"curve": ((5.0, math.inf), (9.0, 20.0))},
+    {"curve": ((0.0, 20.0),)},
+    {"psnr": math.nan},
+    {"psnr": math.inf},
+    {"fit": 0.0},
+    {"machine": {"load_average": None, "cores_usable": None, "cpu": None}},
+]
+
+
+@pytest.mark.parametrize("odd", ODD, ids=str)
+def test_one_odd_run_alone_or_among_others_is_reported(tmp_path, odd):
+    alone = made_up(tmp_path / "odd", **odd)
+    for runs in ([alone], [made_up(tmp_path / "fine", "a", "theirs"), alone]):
+        text = write(runs)
+        assert "| ours" in text
+        assert "nan" not in text.lower()
+
+
+def test_odd_runs_are_drawn_as_far_as_they_have_numbers(tmp_path):
+    runs = [made_up(tmp_path, "a", f"method{k}", **odd) for k, odd in enumerate(ODD)]
+    drawn = dict(zip(("work-precision", "quality-time"), draw(runs, tmp_path / "all"), strict=True))
+    rows = list(csv.DictReader(drawn["work-precision"][0].with_suffix(".csv").open()))
+    assert {row["method"] for row in rows} == {f"method{k}" for k in (0, 1, 2, 3, 4, 8)}
+    rows = list(csv.DictReader(drawn["quality-time"][0].with_suffix(".csv").open()))
+    assert {row["configuration"].split()[0] for row in rows} == {f"method{k}" for k in (3, 5, 6, 7, 8)}
+    assert [png.name.split("_")[0] for png, _ in draw(runs[:1], tmp_path / "no-curve")] == ["work-precision"]
+    assert [png.name.split("_")[0] for png, _ in draw(runs[5:6], tmp_path / "no-score")] == ["quality-time"]
+
+
+def test_a_damaged_curve_is_named(tmp_path):
+    runs = [made_up(tmp_path), made_up(tmp_path, seed=1)]
+    (runs[1].folder / "curve.jsonl").write_text('{"step": 1, "sec')
+    assert f"without a readable curve.jsonl: {runs[1].folder.name}" in section(runs)
+
+
+def test_no_runs_no_figures(tmp_path):
+    assert draw([], tmp_path) == []
+    assert list(tmp_path.iterdir()) == []
+
+
+# ------------------------------------------------------------------------------------------------- sweeps and figures
+
+
+def test_a_sweep_is_every_chain_of_rows_that_differ_in_one_number(tmp_path):
+    found = {s.axis: [value for value, _ in s.members] for s in sweeps(configurations(sweep(tmp_path)))}
+    assert found == {"steps": [50, 100, 200], "texels": [8, 16, 32]}
+
+
+def test_switches_without_order_make_no_sweep_and_lists_are_ordered_by_length(tmp_path):
+    runs = [
+        made_up(tmp_path, config={"levels": [64, 128], "on": True}),
+        made_up(tmp_path, config={"levels": [64], "on": True}, changed=("levels=(64,)",)),
+        made_up(tmp_path, config={"levels": [64, 128], "on": False}, changed=("on=False",)),
+    ]
+    (found,) = sweeps(configurations(runs))
+    assert (found.axis, [value for value, _ in found.members]) == ("levels", [[64], [64, 128]])
+
+
+def test_the_csv_holds_what_the_figure_shows(tmp_path):
+    runs = sweep(tmp_path / "runs", seeds=(0, 1))
+    drawn = [png for png, _ in draw(runs, tmp_path / "out")]
+    assert [png.name for png in drawn] == ["work-precision_p@1_quick.png", "quality-time_p@1_quick.png"]
+    for png in drawn:
+        assert png.with_suffix(".svg").read_text().startswith("<?xml")
+    rows = list(csv.DictReader(drawn[0].with_suffix(".csv").open()))
+    points = work_points(configurations(runs), PSNR.format("body"), ["a", "b"])
+    shown = {row["configuration"]: row for row in rows if row["identity"] == PSNR.format("body")}
+    assert len(points) == len(shown) == 6
+    for p in points:
+        row = shown[p.configuration.label]
+        assert float(row["fit_seconds"]) == p.seconds.value
+        assert float(row["fit_seconds_low"]) == p.seconds.low
+        assert float(row["error"]) == p.error.value == pytest.approx(10 ** (-p.value.value / 20))
+        assert p.error.low <= p.error.value <= p.error.high
+    assert {row["configuration"] for row in shown.values() if row["pareto"] == "True"} == {
+        "ours (steps=50)", "ours", "ours (steps=200)"
+    }  # fmt: skip
+    curves = list(csv.DictReader(drawn[1].with_suffix(".csv").open()))
+    assert {row["kind"] for row in curves} == {"mean"}  # six configurations are a crowd
+    assert {row["identity"] for row in curves} == {x.format(r) for x in (PSNR, FLIP) for r in ("body", "hidden")}
+
+
+def test_few_configurations_show_their_checkpoints_too(tmp_path):
+    (_, (png, _)) = draw([made_up(tmp_path)], tmp_path / "out")
+    rows = list(csv.DictReader(png.with_suffix(".csv").open()))
+    dots = [
+        (float(r["seconds"]), float(r["value"]))
+        for r in rows
+        if r["kind"] == "checkpoint" and "psnr" in r["identity"]
+    ]
+    assert dots[:4] == [(2.0, 15.0), (4.0, 18.0), (8.0, 21.0), (16.0, 23.0)]
+
+
+def test_profiles_and_sizes_of_one_protocol_stand_side_by_side_with_a_warning(tmp_path):
+    runs = [made_up(tmp_path, curve=None)]
+    runs.append(made_up(tmp_path, profile="paper", size=512, fit=900, psnr=28.0, curve=None))
+    runs.append(made_up(tmp_path, protocol="p@1+size=32", size=32, fit=10, psnr=20.0, curve=None))
+    text = markdown(across_sizes_section(runs))
+    assert "their errors only with care" in text
+    for label in ("ours [quick, 64 px]", "ours [paper, 512 px]", "ours [quick, 32 px]"):
+        assert f"| {label} |" in text
+    names = [png.name for png, _ in draw(runs, tmp_path / "out")]
+    assert "work-precision_p@1_profiles-and-sizes.png" in names
+    assert across_sizes_section(runs[:1]) == []
+    other = made_up(tmp_path, protocol="p@1+occlusion=none")
+    assert across_sizes_section([runs[0], other]) == []  # another occlusion is another question

@@ -1,0 +1,147 @@
+"""Markdown, LaTeX and HTML of one report: the same numbers, and nothing that a name can break or run."""
+
+from __future__ import annotations
+
+import re
+from html import unescape
+from html.parser import HTMLParser
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ihbench.reports import html, latex, markdown
+from ihbench.reports.content import general_report
+from ihbench.reports.document import Bullets, Heading, Paragraph, Table, code, strong
+from tests.reports.made_up_runs import made_up
+
+NASTY = r"""<script>alert(1)</script> & "x" 'y' \write18{rm} $a_b^c$ 100% #1 {~} | `q` ]( ↑ 文"""
+BLOCKS = [
+    Heading(2, NASTY),
+    Paragraph((NASTY, strong(NASTY), code(NASTY))),
+    Bullets((NASTY,)),
+    Table((NASTY, "n"), ((NASTY, "1"),)),
+]
+VOID = {"meta", "img", "br"}
+
+
+class Strict(HTMLParser):
+    """Collects tags, attributes and text; fails on tags that do not match."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.tags, self.attributes, self.text = [], [], [], []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.attributes += attrs
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+def parsed(text):
+    reader = Strict()
+    reader.feed(text)
+    reader.close()
+    assert reader.open == []
+    return reader
+
+
+def test_html_shows_every_word_as_it_is_and_runs_none():
+    found = parsed(html.page(BLOCKS))
+    assert "script" not in found.tags
+    assert "".join(found.text).count(NASTY) == 7
+    assert not [name for name, _ in found.attributes if name.startswith("on")]
+
+
+def test_html_is_one_file_that_fetches_nothing(tmp_path):
+    text = html.write([made_up(tmp_path, scene=NASTY.replace("/", " "))])
+    found = parsed(text)
+    links = [value for name, value in found.attributes if name in ("src", "href", "srcset", "action")]
+    assert len(links) >= 2
+    assert all(value.startswith("data:image/png;base64,") for value in links)
+    assert "default-src 'none'" in unescape(text)
+    assert not re.search(r"url\(|@import", text)
+
+
+def test_latex_has_no_active_character_of_anybodys():
+    text = latex.latex(BLOCKS)
+    body = text.split(r"\begin{document}")[1]
+    assert r"\write18" not in body
+    assert r"\textbackslash{}write18\{rm\}" in body
+    assert "[U+6587]" in body
+    assert r"$\uparrow$" in body
+    assert balanced(text)
+
+
+def balanced(text):
+    """Whether braces match, and dollars come in pairs, once escaped ones are gone."""
+    bare = re.sub(r"\\[\\{}$&#_%]", "", text)
+    depth = 0
+    for letter in bare:
+        depth += {"{": 1, "}": -1}.get(letter, 0)
+        if depth < 0:
+            return False
+    return depth == 0 and bare.count("$") % 2 == 0
+
+
+@given(st.text(max_size=30))
+@settings(deadline=None, derandomize=True, max_examples=200)
+def test_whatever_text_it_is_latex_stays_balanced_and_on_its_line(text):
+    out = latex.escape(text)
+    assert balanced(out)
+    assert "\n" not in out
+    assert "\r" not in out
+    assert not re.search(r"(?<!\\)[&#_%]", re.sub(r"\\\\", "", out))
+    assert all(ord(letter) <= latex.LATIN for letter in out)
+
+
+@given(st.text(max_size=30))
+@settings(deadline=None, derandomize=True, max_examples=200)
+def test_whatever_text_it_is_a_markdown_row_keeps_its_cells(text):
+    row = markdown.markdown([Table(("a", "b"), ((text, "1"),))]).splitlines()[2]
+    assert len(re.split(r"(?<!\\)\|", row)) == 4
+    assert "<" not in row
+
+
+def test_latex_tables_are_booktabs_with_as_many_cells_as_columns(tmp_path):
+    text = latex.write([made_up(tmp_path), made_up(tmp_path, "b", seed=1)])
+    assert balanced(text)
+    tables = re.findall(r"\\begin\{tabular\}\{([lr]+)\}\n(.*?)\\end\{tabular\}", text, re.S)
+    assert len(tables) >= 5
+    for columns, body in tables:
+        assert body.count(r"\toprule") == body.count(r"\midrule") == body.count(r"\bottomrule") == 1
+        rows = [line for line in body.splitlines() if line.endswith(r" \\")]
+        assert rows
+        assert {len(re.split(r"(?<!\\)&", row)) for row in rows} == {len(columns)}
+
+
+def test_the_three_say_the_same_numbers(tmp_path):
+    runs = [made_up(tmp_path, s, psnr=p) for s, p in (("a", 23.456), ("b", 27.891))]
+    found = [
+        sorted(re.findall(r"\d+\.\d{2,4}(?!\d)", re.sub(r"<style>.*?</style>|src=\"[^\"]*\"", "", text, flags=re.S)))
+        for text in (markdown.write(runs), latex.write(runs), html.page(general_report(runs)))
+    ]
+    assert found[0] == found[1] == found[2]
+    assert "25.67" in found[0]
+
+
+def test_pictures_are_named_relative_to_where_the_text_lies(tmp_path):
+    picture = tmp_path / "out" / "figures" / "a b.png"
+    picture.parent.mkdir(parents=True)
+    picture.write_bytes(b"\x89PNG")
+    shown = {"pictures": [(picture, "What | it <shows>")], "folder": tmp_path / "out"}
+    assert "(<figures/a b.png>)" in markdown.write([], **shown)
+    assert r"\detokenize{figures/a b.png}" in latex.write([], **shown)
+    assert "data:image/png;base64,iVBORw==" in html.write([], **shown)
+
+
+def test_a_row_of_the_wrong_length_is_refused():
+    with pytest.raises(ValueError, match="rows of 2 cells"):
+        Table(("a", "b"), (("1",),))
