@@ -5,8 +5,9 @@ Nothing here imports torch or cv2: `ihbench plan` answers fast.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,7 +41,7 @@ class Omission:
     field: str
     value: Any
     reason: str
-    spares: Mapping[str, float] = field(default_factory=dict)
+    spares: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     def seconds(self, stages: Mapping[str, float]) -> float | None:
         """What this saves in those of its stages whose seconds are known; None when none is."""

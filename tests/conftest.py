@@ -18,6 +18,8 @@ from unittest.mock import patch
 import pytest
 
 os.environ.setdefault("GOMP_SPINCOUNT", "10000")  # as the command line does; before anything imports torch
+if "PYTEST_XDIST_WORKER" in os.environ:  # a process a core: more threads would only wait for each other
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from ihbench import registry
 from ihbench.cli import main

@@ -60,7 +60,7 @@ def _panel(
     lines: list[list[tuple[float, float]]] = []
     for k, case in enumerate(dict.fromkeys(row["case"] for row in rows)):
         colour, mark = diagram.COLOURS[k % len(diagram.COLOURS)], diagram.MARKS[k % len(diagram.MARKS)]
-        mine = sorted((row for row in rows if row["case"] == case), key=lambda row: row["forward_ms"])
+        mine = [row for row in rows if row["case"] == case]
         points = [(row["forward_ms"], row["value_error"] or exact) for row in mine]
         joined = "-" if all(row.get("knob") for row in mine) else ""
         panel.plot(

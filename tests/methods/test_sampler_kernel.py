@@ -12,7 +12,7 @@ from tests.methods.tiny_diffusion import CROP, same, tiny_backbone, weights
 def test_as_many_steps_as_the_reference_differ_by_rounding_alone_and_fewer_by_more():
     backbone = tiny_backbone()
     before = weights(backbone.unet)
-    rows = sampler_rows(1, steps=(1, 3, 6), many=6, backbone=backbone)
+    rows = sampler_rows(1, steps=(1, 3, 6), many=6, given=backbone)
     assert [r["backend"] for r in rows] == ["1 steps", "3 steps", "6 steps"] * 2
     assert len({r["case"] for r in rows}) == 2
     for k in (0, 3):

@@ -28,15 +28,14 @@ SEED = 0
 
 
 def sampler_rows(
-    repeats: int, steps: Sequence[int] = STEPS, many: int = MANY, backbone: Backbone | None = None
+    repeats: int, steps: Sequence[int] = STEPS, many: int = MANY, given: Backbone | None = None
 ) -> list[Row]:
     """One crop of a procedural person whose middle half is hidden, painted from no noise (the default of `mini`) and
     from full noise. Value error: root mean square over the hidden pixels, peak 1, against `many` steps in float64.
 
     `repeats` above 3 are 3.
     """
-    if backbone is None:
-        backbone = load_mini()
+    backbone = load_mini() if given is None else given
     view = hidden_middle(backbone.size)
     batch = batch_of([view], backbone.device)
     hidden = batch.unknown.expand(-1, 3, -1, -1) > 0.5
