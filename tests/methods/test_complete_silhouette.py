@@ -19,9 +19,8 @@ from ihbench.methods.inpainthuman.inpainting.complete_silhouette import (
 )
 from ihbench.methods.inpainthuman.inpainting.crop_view import CropView, cut_view
 from ihbench.methods.inpainthuman.inpainting.part_map import NO_PART
+from ihbench.threads import one_torch_thread
 from tests.bench.fake_capture import WHITE, a_camera, a_pose, the_body, train_view
-
-from .tiny_fit import one_thread
 
 FINDERS = [CoverageSilhouette(WHITE), GrabCutSilhouette(WHITE)]
 NAMES = ["coverage", "grabcut"]
@@ -31,7 +30,7 @@ COAT = 2  # px by which the person stands off the body model
 
 @pytest.fixture(scope="module", autouse=True)
 def single_thread():
-    with one_thread():
+    with one_torch_thread():
         yield
 
 

@@ -20,6 +20,7 @@ from ihbench.methods.inpainthuman.inpainting.texture_fills import (
 )
 from ihbench.metrics import psnr
 from ihbench.progress import Progress
+from ihbench.threads import one_torch_thread
 from tests.bench.fake_capture import the_body
 
 from .hidden_person import (
@@ -34,7 +35,6 @@ from .hidden_person import (
     truth,
     two_sided,
 )
-from .tiny_fit import one_thread
 
 BODY = the_body()
 BLUE = (0.2, 0.4, 1.0)
@@ -53,7 +53,7 @@ def eight_bit(rgb):
 
 @pytest.fixture(scope="module", autouse=True)
 def single_thread():
-    with one_thread():
+    with one_torch_thread():
         yield
 
 

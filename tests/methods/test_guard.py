@@ -14,8 +14,9 @@ from ihbench.methods.inpainthuman.optimisation import GOOD_EVERY, MOST_ROLL_BACK
 from ihbench.methods.inpainthuman.stage1 import Stage1, loss_of, prepare_target
 from ihbench.progress import Progress
 from ihbench.scene import MaskState
+from ihbench.threads import one_torch_thread
 
-from .tiny_fit import an_avatar, equal_bits, fitted, one_thread, parameters_of, training_set, training_views
+from .tiny_fit import an_avatar, equal_bits, fitted, parameters_of, training_set, training_views
 
 STEPS = GOOD_EVERY + 12
 BAD = GOOD_EVERY + 5
@@ -24,7 +25,7 @@ SMALL = {"texels": 32, "levels": (16,), "pose_residual": False, "steps": STEPS}
 
 @pytest.fixture(scope="module", autouse=True)
 def single_thread():
-    with one_thread():
+    with one_torch_thread():
         yield
 
 

@@ -18,9 +18,10 @@ from ihbench.methods.inpainthuman.decoder import GaussianDecoder, positional_enc
 from ihbench.methods.inpainthuman.method import InpaintHuman
 from ihbench.render.splat import LOW_PASS, render_gaussians
 from ihbench.scene import BodyPose
+from ihbench.threads import one_torch_thread
 from tests.bench.fake_capture import DISTANCE, WHITE, a_camera, a_pose, rasterized, the_body
 
-from .tiny_fit import SIZE, TINY, an_avatar, equal_bits, one_thread, parameters_of, random_pose, shaken
+from .tiny_fit import SIZE, TINY, an_avatar, equal_bits, parameters_of, random_pose, shaken
 
 BODY = the_body()
 BETAS = np.random.default_rng(5).normal(0, 1, 10)
@@ -28,7 +29,7 @@ BETAS = np.random.default_rng(5).normal(0, 1, 10)
 
 @pytest.fixture(scope="module", autouse=True)
 def single_thread():
-    with one_thread():
+    with one_torch_thread():
         yield
 
 

@@ -16,20 +16,10 @@ from ihbench.metrics import psnr
 from ihbench.progress import Progress
 from ihbench.render.splat import render_gaussians
 from ihbench.scene import MaskState, TrainingSet
+from ihbench.threads import one_torch_thread
 from tests.bench.fake_capture import WHITE, a_camera, a_pose, the_body, train_view
 
-from .tiny_fit import (
-    SIZE,
-    TINY,
-    an_avatar,
-    equal_bits,
-    fitted,
-    one_thread,
-    parameters_of,
-    shaken,
-    training_set,
-    training_views,
-)
+from .tiny_fit import SIZE, TINY, an_avatar, equal_bits, fitted, parameters_of, shaken, training_set, training_views
 
 BODY = the_body()
 BLUE = (0.1, 0.2, 0.9)
@@ -37,7 +27,7 @@ BLUE = (0.1, 0.2, 0.9)
 
 @pytest.fixture(scope="module", autouse=True)
 def single_thread():
-    with one_thread():
+    with one_torch_thread():
         yield
 
 

@@ -16,8 +16,8 @@ from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
 from ihbench.methods.inpainthuman.inpainting.personalise import Personaliser, best_seen
 from ihbench.methods.inpainthuman.inpainting.subject_token import ANYBODY, SubjectToken
 from ihbench.progress import Progress
+from ihbench.threads import one_torch_thread
 from tests.methods.tiny_diffusion import crops, images_equal, same, tiny_backbone, weights
-from tests.methods.tiny_fit import one_thread
 
 QUIET = Progress.silent()
 TINY = InpaintConfig(ti_steps=3, lora_steps=3, batch=2, sampler_steps=2)
@@ -26,7 +26,7 @@ HIDE = slice(28, 36)
 
 @pytest.fixture(autouse=True)
 def threads():
-    with one_thread():
+    with one_torch_thread():
         yield
 
 

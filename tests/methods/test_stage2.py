@@ -18,8 +18,9 @@ from ihbench.methods.inpainthuman.inpainting.surface_need import SeenSurface, ke
 from ihbench.methods.inpainthuman.stage2 import Stage2
 from ihbench.progress import Progress
 from ihbench.scene import MaskState
+from ihbench.threads import one_torch_thread
 from tests.bench.fake_capture import a_camera, a_pose, the_body, train_view
-from tests.methods.tiny_fit import SIZE, an_avatar, one_thread, shaken, training_set, training_views
+from tests.methods.tiny_fit import SIZE, an_avatar, shaken, training_set, training_views
 
 QUIET = Progress.silent()
 HIDDEN = slice(28, 36)
@@ -28,7 +29,7 @@ SIMPLE = InpaintConfig(filler="mean", key_views=0)
 
 @pytest.fixture(autouse=True)
 def threads():
-    with one_thread():
+    with one_torch_thread():
         yield
 
 

@@ -21,20 +21,10 @@ from ihbench.metrics.lpips import lpips, random_networks
 from ihbench.metrics.ssim import ssim_map
 from ihbench.progress import Progress
 from ihbench.scene import MaskState, TrainView
+from ihbench.threads import one_torch_thread
 from tests.bench.fake_capture import WHITE, a_camera, a_pose, train_view
 
-from .tiny_fit import (
-    SIZE,
-    STRIP,
-    an_avatar,
-    equal_bits,
-    fitted,
-    one_thread,
-    parameters_of,
-    shaken,
-    training_set,
-    training_views,
-)
+from .tiny_fit import SIZE, STRIP, an_avatar, equal_bits, fitted, parameters_of, shaken, training_set, training_views
 
 door = sys.modules["ihbench.metrics.lpips"]  # the package's `lpips` is the function
 REFINE = RefineConfig(steps=10, lpips=0.0)
@@ -43,7 +33,7 @@ BLUE = (0.1, 0.2, 0.9)
 
 @pytest.fixture(scope="module", autouse=True)
 def single_thread():
-    with one_thread():
+    with one_torch_thread():
         yield
 
 

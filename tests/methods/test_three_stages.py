@@ -17,17 +17,18 @@ from ihbench.methods.inpainthuman.stage1 import Stage1
 from ihbench.progress import Progress
 from ihbench.protocol import load_protocol
 from ihbench.run_loop import RunRequest, _outside
+from ihbench.threads import one_torch_thread
 from tests.bench.fake_capture import a_camera, a_pose, train_view
 from tests.methods.sd2_miniature import make_miniature
 from tests.methods.tiny_diffusion import tiny_backbone
-from tests.methods.tiny_fit import SIZE, TINY, equal_bits, one_thread, parameters_of, training_set
+from tests.methods.tiny_fit import SIZE, TINY, equal_bits, parameters_of, training_set
 
 QUIET = Progress.silent()
 
 
 @pytest.fixture(autouse=True)
 def threads():
-    with one_thread():
+    with one_torch_thread():
         yield
 
 

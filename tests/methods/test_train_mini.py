@@ -24,8 +24,8 @@ from ihbench.methods.inpainthuman.inpainting.mini_training import MiniTraining
 from ihbench.methods.inpainthuman.inpainting.mini_weights import load_mini, save_mini
 from ihbench.methods.inpainthuman.inpainting.train_mini import MiniTrainer, curve_of
 from ihbench.progress import Progress
+from ihbench.threads import one_torch_thread
 from tests.methods.tiny_diffusion import same, tiny_backbone, weights
-from tests.methods.tiny_fit import one_thread
 
 QUIET = Progress.silent()
 SMALL = MiniTraining(people=2, each=2, steps=4, batch=3)
@@ -41,7 +41,7 @@ def small(monkeypatch):
     for module in (mini_model, mini_batches, train_mini, mini_weights):
         monkeypatch.setattr(module, "SIZE", SIDE)
     monkeypatch.setattr(mini_validation, "PEOPLE", 2)
-    with one_thread():
+    with one_torch_thread():
         yield
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -31,17 +29,6 @@ TINY = replace(
     steps=10,
     inpaint=replace(QUICK.inpaint, on=False),
 )
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Tensors this small only wait for a second thread; on a busy machine a hundred times longer than they work."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def an_avatar(seed: int = 0, betas: Any = None, **changes: Any) -> GaussianAvatar:
