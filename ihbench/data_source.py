@@ -14,6 +14,7 @@ from ihbench.protocol import Protocol
 from ihbench.scene import Capture
 
 STANDIN_SEED = 0
+LARGEST_CAST = 99  # people of a stand-in that can be named, whether a protocol names them or not
 
 
 def cache_folder() -> Path:
@@ -70,6 +71,8 @@ class DataSource:
 def locate(protocol: Protocol, data: Path | None, scenes: tuple[str, ...]) -> DataSource:
     """Find the data of a protocol. No `scenes` means all that the protocol names (of a user's copy: those present).
 
+    Of a stand-in any person may be named: standin-1, standin-2, …
+
     Raises `BadInput` for unknown scenes, with the nearest known one.
     """
     root = own_data(data)
@@ -82,8 +85,10 @@ def locate(protocol: Protocol, data: Path | None, scenes: tuple[str, ...]) -> Da
             f"protocol {protocol.name}: data set {protocol.dataset!r} has no stand-in; give your copy with --data"
         )
     known = list(protocol.standin_subjects)
+    cast = registry.load("stand-in", protocol.dataset).subjects(LARGEST_CAST)
+    found = [*known, *(scene for scene in scenes if scene in cast and scene not in known)]
     root = standin_root(protocol.dataset)
-    return DataSource(protocol, root, True, _chosen(scenes, known, known, "of the stand-in (no --data given)"))
+    return DataSource(protocol, root, True, _chosen(scenes, known, found, "of the stand-in (no --data given)"))
 
 
 def standin_root(dataset: str) -> Path:

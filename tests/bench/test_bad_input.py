@@ -191,7 +191,7 @@ def test_everybody_hidden_in_every_frame(refused_run, refused, tmp_path, monkeyp
         ("runn --protocol zju_occ", "unknown command 'runn': did you mean 'run'?"),
         ("run --protocol zju_ocd", "unknown protocol 'zju_ocd': did you mean 'zju_occ'?"),
         ("run --protocol zju_occ --method inpainthumann", "did you mean 'inpainthuman'?"),
-        ("run --protocol zju_occ --scene standin-11", "unknown scene 'standin-11'"),
+        ("run --protocol zju_occ --scene standin-0", "unknown scene 'standin-0'"),
         ("run --protocol zju_occ --profile quik", "did you mean 'quick'?"),
         ("run --protocol zju_occ --occlusion.rule fixed-stripe", "did you mean 'fixed-strip'?"),
         ("run --protocol zju_occ --keep level", "did you mean 'levels'?"),

@@ -34,6 +34,15 @@ def own_video(tmp_path_factory):
     return folder
 
 
+def test_any_person_of_a_stand_in_can_be_named():
+    protocol = load_protocol("people_snapshot_occ", "quick")
+    assert locate(protocol, None, ("standin-8", "standin-2")).scenes == ("standin-8", "standin-2")
+    assert locate(protocol, None, ()).scenes == protocol.standin_subjects
+    for name in ("standin-0", "standin-08", "standin-100", "male-3-casual"):
+        with pytest.raises(BadInput, match=f"unknown scene '{name}'"):
+            locate(protocol, None, (name,))
+
+
 def test_a_video_of_ones_own_runs_with_its_own_body(own_video, tmp_path, mannequin, bench, capsys):
     words = ["run", "--protocol", "custom_occ", "--data", own_video, "--runs", tmp_path, "--method", "mannequin"]
     with bench.in_its_world():
