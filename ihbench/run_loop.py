@@ -228,7 +228,7 @@ class _Run(RecordedRun):
         for state, free in states.items():
             other = lender(self.request.runs, self.folder, state, free)
             if other is not None:
-                lend(other, self.folder, state)
+                self.ledger.events.extend(lend(other, self.folder, state))  # that it went back, say
                 self.ledger.event("shared", state=state, run=other.record["digest"])
 
     def _render(self, avatar: Avatar, view: TestView) -> NDArray[np.float32]:

@@ -29,8 +29,8 @@ def lender(runs: Path, borrower: RunFolder, state: str, free: Sequence[str]) -> 
     return None
 
 
-def lend(other: RunFolder, borrower: RunFolder, state: str) -> None:
-    """Copy the state, and the points of the quality-time curve up to it."""
+def lend(other: RunFolder, borrower: RunFolder, state: str) -> list[dict[str, Any]]:
+    """Copy the state, and the points of the quality-time curve up to it. Gives the ledger's events of that stage."""
     target = _file(borrower.path, state)
     target.parent.mkdir(parents=True, exist_ok=True)
     copy = target.with_name(f".{target.name}.tmp")
@@ -39,6 +39,7 @@ def lend(other: RunFolder, borrower: RunFolder, state: str) -> None:
     last = _last_step(target)
     points = [point for point in other.curve() if point["step"] <= last]
     atomic.write_json_lines(borrower.path / "curve.jsonl", points)
+    return [event for event in other.record["ledger"]["events"] if event["data"].get("stage") == state]
 
 
 def _last_step(file: Path) -> int:

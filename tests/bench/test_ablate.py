@@ -7,6 +7,7 @@ import os
 import signal
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from ihbench import cells as cells_module
@@ -18,9 +19,11 @@ from ihbench.commands import ablate as ablate_command
 from ihbench.commands.ablate import AblateOptions
 from ihbench.config_fields import flat
 from ihbench.errors import BadInput
+from ihbench.ledger import Ledger
 from ihbench.methods.inpainthuman.config import PROFILES, QUICK
 from ihbench.progress import Progress
 from ihbench.results import read_result
+from ihbench.shared_states import lend
 from ihbench.store import RunFolder
 from tests.conftest import SCENES
 
@@ -170,6 +173,24 @@ def test_rungs_that_begin_alike_share_their_first_stage_and_its_seconds(bench):
     assert events[1]["shared"] == {"state": "stage1", "run": read_json(bench.folders()[0] / "run.json")["digest"]}
     stages = [read_json(folder / "run.json")["ledger"]["stages"] for folder in bench.folders()]
     assert stages[1]["fit/stage1"]["seconds"] >= 0.5 * stages[0]["fit/stage1"]["seconds"]
+
+
+def test_what_happened_in_a_lent_stage_is_told_of_the_borrower_too(tmp_path):
+    """And nothing that happened later in the lender."""
+    lender, borrower = tmp_path / "lender", tmp_path / "borrower"
+    ledger = Ledger(lender)
+    ledger.event("rolled_back", stage="stage1", step=25, bad_step=30)
+    ledger.save_state("stage1", {"x": np.zeros(3)}, {"step": 600})
+    ledger.event("rolled_back", stage="stage3", step=650, bad_step=651)
+    ledger.event("warning", what="it rains")
+    record = {"ledger": ledger.state()}
+    points = [{"step": 300}, {"step": 600}, {"step": 700}]
+    other = SimpleNamespace(path=lender, record=record, curve=lambda: points)
+    borrower.mkdir()
+    events = lend(other, SimpleNamespace(path=borrower), "stage1")  # pyright: ignore
+    assert [(event["kind"], event["data"]["step"]) for event in events] == [("rolled_back", 25)]
+    assert Ledger(borrower).load_state("stage1")[1] == {"step": 600}  # pyright: ignore
+    assert len((borrower / "curve.jsonl").read_text().splitlines()) == 2
 
 
 @pytest.mark.parametrize(

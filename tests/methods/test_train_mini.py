@@ -169,6 +169,11 @@ class TestWeights:
         assert loaded.prefill
         assert not any(p.requires_grad for p in loaded.unet.parameters())
 
+    def test_saving_and_loading_print_nothing(self, tmp_path, capfd):
+        save_mini(tiny_backbone(), tmp_path)
+        load_mini(tmp_path)
+        assert capfd.readouterr() == ("", "")
+
     def test_a_folder_that_lacks_parts(self, tmp_path):
         with pytest.raises(BadInput, match="lacks unet, controlnet"):
             load_mini(tmp_path)

@@ -30,6 +30,7 @@ from ihbench.errors import BadInput
 from ihbench.methods.inpainthuman.inpainting.checkpoint import has_pickles, read_json, weight_files
 from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
 from ihbench.methods.inpainthuman.inpainting.part_map import smpl_parts
+from ihbench.methods.inpainthuman.inpainting.quiet_libraries import quiet_libraries
 
 RIM = 0.03  # of the body's height in the crop: how far inside and outside of the posed body the painted image decides
 DEEP = 0.02  # of the body's height: so far inside the person the colour is no mixture
@@ -251,11 +252,12 @@ def _load_sam(weights: str, device: str) -> tuple[Any, Any]:
     except ImportError as error:
         raise BadInput(f"silhouette 'sam' needs transformers 4.52 or newer ({error}); update it") from error
     try:
-        loaded: Any = SamHQModel.from_pretrained(
-            str(folder), local_files_only=True, use_safetensors=True, output_loading_info=True
-        )
-        model, report = loaded
-        processor = SamHQProcessor.from_pretrained(str(folder), local_files_only=True)
+        with quiet_libraries():
+            loaded: Any = SamHQModel.from_pretrained(
+                str(folder), local_files_only=True, use_safetensors=True, output_loading_info=True
+            )
+            model, report = loaded
+            processor = SamHQProcessor.from_pretrained(str(folder), local_files_only=True)
     except Exception as error:  # the libraries raise all sorts for a bad file
         first = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise BadInput(f"{SAM_OPTION} {folder}: not readable ({first}); fetch it again") from error

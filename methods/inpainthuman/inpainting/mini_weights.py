@@ -11,6 +11,7 @@ from ihbench.errors import BadInput
 from ihbench.methods.inpainthuman.inpainting.backbone import Backbone
 from ihbench.methods.inpainthuman.inpainting.block_transform import BlockTransform
 from ihbench.methods.inpainthuman.inpainting.mini_model import SIZE
+from ihbench.methods.inpainthuman.inpainting.quiet_libraries import quiet_libraries
 
 SHIPPED = Path(__file__).parent / "mini"
 PARTS = ("unet", "controlnet", "text_encoder", "tokenizer", "codec", "scheduler")
@@ -23,7 +24,8 @@ def save_mini(backbone: Backbone, folder: Path) -> None:
         kind = torch.float32 if name == "codec" else torch.float16
         # rounded and put back: a copy would take along whatever hooks a training has on the module
         original = {key: value.detach().clone() for key, value in part.state_dict().items()}
-        part.to(kind).save_pretrained(folder / name, safe_serialization=True)
+        with quiet_libraries():  # parts that like float32 complain of being rounded
+            part.to(kind).save_pretrained(folder / name, safe_serialization=True)
         part.to(torch.float32)
         part.load_state_dict(original)
     backbone.tokenizer.save_pretrained(folder / "tokenizer")
@@ -49,20 +51,21 @@ def load_mini(folder: Path | None = None, device: str = "cpu") -> Backbone:
 
     given: dict[str, Any] = {"local_files_only": True, "use_safetensors": True, "torch_dtype": torch.float32}
     try:
-        backbone = Backbone(
-            name="mini",
-            unet=UNet2DConditionModel.from_pretrained(folder / "unet", **given),
-            text_encoder=CLIPTextModel.from_pretrained(
-                folder / "text_encoder", local_files_only=True, use_safetensors=True
-            ).float(),
-            tokenizer=AutoTokenizer.from_pretrained(folder / "tokenizer", local_files_only=True),
-            controlnet=ControlNetModel.from_pretrained(folder / "controlnet", **given),
-            codec=BlockTransform.from_pretrained(folder / "codec", **given),
-            scheduler=DDIMScheduler.from_pretrained(folder / "scheduler"),
-            size=SIZE,
-            square=False,
-            prefill=True,
-        )
+        with quiet_libraries():
+            backbone = Backbone(
+                name="mini",
+                unet=UNet2DConditionModel.from_pretrained(folder / "unet", **given),
+                text_encoder=CLIPTextModel.from_pretrained(
+                    folder / "text_encoder", local_files_only=True, use_safetensors=True
+                ).float(),
+                tokenizer=AutoTokenizer.from_pretrained(folder / "tokenizer", local_files_only=True),
+                controlnet=ControlNetModel.from_pretrained(folder / "controlnet", **given),
+                codec=BlockTransform.from_pretrained(folder / "codec", **given),
+                scheduler=DDIMScheduler.from_pretrained(folder / "scheduler"),
+                size=SIZE,
+                square=False,
+                prefill=True,
+            )
     except Exception as error:  # whatever a damaged file makes of four libraries' readers
         words = str(error).splitlines()
         raise BadInput(
