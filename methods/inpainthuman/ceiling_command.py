@@ -1,0 +1,169 @@
+"""`ihbench ceiling RUN...`: what finished runs would have reached with a better painter."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from ihbench.errors import BadInput
+
+if TYPE_CHECKING:
+    from ihbench.methods.inpainthuman.ceiling import CeilingRow
+    from ihbench.metrics.statistics import Paired
+
+SUMMARY = "what InpaintHuman's runs would have reached with a better painter, up to one that knows the truth"
+REGIONS = ("hidden", "visible", "never_seen")
+STAGE1 = "stage 1 alone"
+
+
+@dataclass(frozen=True)
+class CeilingOptions:
+    run: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    """Folders of finished runs that painted."""
+    truth: tuple[float, ...] = (0.5, 1.0)
+    """Shares of the way from the painted colours to the true ones; each costs a stage 3 per run."""
+    data: Path | None = None
+    """Your copy of the data set, if the runs used one."""
+    body: Path | None = None
+    """SMPL model file, likewise."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where to fit."""
+    out: Path | None = None
+    """Folder for `ceiling.md` and `ceiling.json`."""
+    json: bool = False
+    """Print one JSON object on stdout and nothing else there."""
+
+
+def main(argv: list[str]) -> int:
+    from ihbench.commands.parse import options
+
+    return _ceiling(options(CeilingOptions, argv, "ceiling", f"Measure {SUMMARY}."))
+
+
+def _ceiling(chosen: CeilingOptions) -> int:
+    from ihbench.atomic import write_json, write_text
+    from ihbench.methods.inpainthuman.ceiling import ceiling
+    from ihbench.progress import Progress
+    from ihbench.results import read_result
+
+    if not chosen.run:
+        raise BadInput("ceiling: of which run? give one or more run folders")
+    if not chosen.truth or not all(0 < share <= 1 for share in chosen.truth):
+        raise BadInput(f"--truth {' '.join(map(str, chosen.truth))}: expected shares above 0, at most 1")
+    if chosen.device == "cuda":
+        from ihbench.commands.run import require_cuda
+
+        require_cuda()
+    results = [read_result(folder) for folder in chosen.run]
+    groups = {result.group[:3] for result in results}
+    if len(groups) > 1:
+        raise BadInput(f"ceiling: runs of one protocol and profile at a time, got {sorted(map(str, groups))}")
+    progress, found, text = Progress(), [], ""
+    numbers: dict[str, Any] = {}
+    for result in results:
+        shares = tuple(sorted(set(chosen.truth)))
+        rows = ceiling(result.folder, shares, chosen.data, chosen.body, chosen.device, progress)
+        found.append((result.scene, rows))
+        for row in rows:
+            told = ", ".join(f"{region} {_mean(row, region):.2f}" for region in REGIONS)
+            progress.say(f"{result.scene} seed {result.identity['seed']}, {row.name}: {told}")
+        runs = [_numbers(r, its_rows) for r, (_, its_rows) in zip(results, found, strict=False)]
+        numbers = {"title": _title(results), "runs": runs}
+        text = table(found, _title(results))
+        if chosen.out is not None:  # after every run: the next may take minutes
+            write_text(chosen.out / "ceiling.md", text + "\n")
+            write_json(chosen.out / "ceiling.json", numbers)
+    print(json.dumps(numbers, allow_nan=False) if chosen.json else text)
+    return 0
+
+
+def _title(results: Sequence[Any]) -> str:
+    scenes = len({result.scene for result in results})
+    return f"{results[0].identity['protocol']}, {len(results)} runs of {scenes} scenes, {results[0].data}"
+
+
+def table(found: Sequence[tuple[str, Sequence[CeilingRow]]], title: str) -> str:
+    """Markdown: a row for each painting, means over scenes, differences to stage 1 paired over scenes."""
+    regions = [region for region in REGIONS if any(math.isfinite(_mean(rows[0], region)) for _, rows in found)]
+    heads = [f"PSNR {region} ↑ | over stage 1" for region in regions]
+    lines = [f"### What a better painter would give: {title}", ""]
+    lines += [f"| paintings | their PSNR ↑ | {' | '.join(heads)} |", "|---|---:|" + "---:|---|" * len(regions)]
+    for k, row in enumerate(found[0][1]):
+        quality = _average([(scene, rows[k].painted_psnr) for scene, rows in found])
+        cells = [_decibels(_over_scenes(quality))]
+        for region in regions:
+            own = _average([(scene, _mean(rows[k], region)) for scene, rows in found])
+            first = _average([(scene, _mean(rows[0], region)) for scene, rows in found])
+            cells += [_decibels(_over_scenes(own)), "" if row.truth is None else _gain(own, first)]
+        lines.append(f"| {row.name} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _mean(row: CeilingRow, region: str) -> float:
+    """PSNR of the first preset in a region; NaN where the protocol or the scene has none."""
+    from ihbench.metrics import Identity
+
+    for identity, value in row.scores.items():
+        parsed = Identity.parse(identity)
+        if parsed.metric == "psnr" and parsed.region == region:
+            return value
+    return math.nan
+
+
+def _average(values: Sequence[tuple[str, float]]) -> dict[str, float]:
+    """Scene -> mean over its runs, of scenes that have the number."""
+    scenes: dict[str, list[float]] = {}
+    for scene, value in values:
+        if not math.isnan(value):
+            scenes.setdefault(scene, []).append(value)
+    return {scene: sum(own) / len(own) for scene, own in scenes.items()}
+
+
+def _over_scenes(values: Mapping[str, float]) -> float:
+    return sum(values.values()) / len(values) if values else math.nan
+
+
+def _gain(own: Mapping[str, float], first: Mapping[str, float]) -> str:
+    both = sorted(set(own) & set(first))
+    if not both:
+        return "—"
+    if len(both) == 1:
+        return f"{own[both[0]] - first[both[0]]:+.2f}"
+    pair = _paired({s: own[s] for s in both}, {s: first[s] for s in both}).interval
+    return f"{pair.value:+.2f} [{pair.low:+.2f}, {pair.high:+.2f}]"
+
+
+def _paired(a: Mapping[str, float], b: Mapping[str, float]) -> Paired:
+    from ihbench.metrics.statistics import paired_test
+
+    return paired_test(a, b)
+
+
+def _decibels(value: float) -> str:
+    return "—" if math.isnan(value) else "∞" if math.isinf(value) else f"{value:.2f}"
+
+
+def _numbers(result: Any, rows: Sequence[CeilingRow]) -> dict[str, Any]:
+    def plain(value: float) -> float | str | None:
+        return None if math.isnan(value) else "inf" if math.isinf(value) else value
+
+    return {
+        "scene": result.scene,
+        "seed": result.identity["seed"],
+        "run": result.record["digest"],
+        "rows": [
+            {
+                "paintings": row.name,
+                "truth": row.truth,
+                "painted_psnr": plain(row.painted_psnr),
+                "scores": {identity: plain(value) for identity, value in row.scores.items()},
+            }
+            for row in rows
+        ],
+    }
