@@ -29,7 +29,8 @@ class RefineConfig:
     warm_up: float = 0.1
     """Share of the steps over which step sizes rise: AdamW starts anew, and its first steps would undo stage 1."""
     painted_share: float = 0.5
-    """Share of the steps, at least, that take a painted view: often few of the views are."""
+    """Share of the steps that take a painted view where fewer of the views are painted; none is taken more than twice
+    as often as in turn."""
 
     def __post_init__(self) -> None:
         rules = [

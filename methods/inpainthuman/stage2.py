@@ -11,9 +11,15 @@ from ihbench.ledger import Ledger
 from ihbench.methods.inpainthuman.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.inpainting.crop_view import CropView, Inpainter, cut_view, with_frames
 from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
+from ihbench.methods.inpainthuman.inpainting.own_guess import painter_weight, with_own_guess
 from ihbench.methods.inpainthuman.inpainting.painted_view import PaintedView, paste_back
 from ihbench.methods.inpainthuman.inpainting.shown_view import turntable_view, with_known_surface
-from ihbench.methods.inpainthuman.inpainting.surface_need import SeenSurface, key_views, seen_surface
+from ihbench.methods.inpainthuman.inpainting.surface_need import (
+    SeenSurface,
+    distance_to_seen,
+    key_views,
+    seen_surface,
+)
 from ihbench.progress import Progress
 from ihbench.scene import MaskState, TrainingSet, TrainView
 
@@ -59,6 +65,8 @@ class Stage2:
             # the simple painters take their colours from whatever frame shows them
             given = crops if self.config.filler == "diffusion" else filmed
             painted = painter.inpaint(given, progress)[: len(crops)]
+            if self.config.context == "seen":
+                painted = [self._with_own_guess(*each, surface) for each in zip(crops, painted, strict=True)]
         with self.ledger.stage("silhouette"):
             silhouettes = [finder.complete(view, image) for view, image in zip(crops, painted, strict=True)]
         out = [
@@ -112,6 +120,14 @@ class Stage2:
 
         device = str(self.avatar.device)
         return silhouette_finder(self.config.silhouette, self.training.background, self.config.sam_weights, device)
+
+    def _with_own_guess(self, view: CropView, painted: NDArray[np.uint8], surface: SeenSurface) -> NDArray[np.uint8]:
+        if self.config.near == 0:
+            return painted
+        body = self.training.body
+        distance = distance_to_seen(body.pose(view.body_pose), body, view.camera, surface)
+        guess, _ = self.avatar.render(view.camera, view.body_pose, self.training.background)
+        return with_own_guess(painted, guess, painter_weight(distance, self.config.near), view.unknown)
 
     def _original(self, index: int) -> TrainView | None:
         return self.training.views[index] if index < len(self.training.views) else None

@@ -35,6 +35,7 @@ from ihbench.scene import MaskState, TrainingSet, TrainView
 from ihbench.views import LazyViews
 
 STATE = "stage3"
+MOST_OFTEN = 2  # times as often as in turn a painted view is taken at most: a few of them would be learned by heart
 
 
 def completed_view(
@@ -131,7 +132,8 @@ class Stage3(Optimisation):
         made, filmed = self._made, self._as_filmed
         if not made or not filmed:
             return super()._view_of(step, n)
-        share = max(self.config.painted_share, len(made) / n)
+        in_turn = len(made) / n
+        share = max(in_turn, min(self.config.painted_share, MOST_OFTEN * in_turn))
         before, after = int(step * share), int((step + 1) * share)
         if after > before:
             return made[super()._view_of(before, len(made))]

@@ -383,6 +383,15 @@ def test_painted_views_take_their_share_of_the_steps_and_every_view_its_turn(vie
     assert order == [stage._view_of(step, 6) for step in range(20)]
 
 
+def test_a_few_painted_views_are_not_learned_by_heart(views, painted):
+    """One of six views is painted: half of the steps would take it three times as often as in turn."""
+    config = replace(REFINE, painted_share=0.5)
+    stage = Stage3(an_avatar(), training_set(views), painted[:1], 0, Ledger(), config)
+    order = [stage._view_of(step, 6) for step in range(30)]
+    assert order.count(painted[0].index) == 10
+    assert len(set(order)) == 6
+
+
 # ---------------------------------------------------------------------------------------------------- LPIPS
 
 
