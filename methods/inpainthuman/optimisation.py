@@ -1,5 +1,7 @@
 """What stages 1 and 3 share: AdamW on the avatar, step by step, stopped after any step and gone on with later.
 
+With `maps_only` the UV feature maps alone are optimised; the decoder and the residual's encoder stay as they are.
+
 The guard has three parts. Gradients are clipped. A step whose loss or gradient is not finite, or whose loss has
 exploded, is rejected: the fit goes back to the last good state and on with smaller step sizes, a bounded number of
 times, and the ledger has an event of each. What that cannot mend is a divergence, recorded with its first bad step.
@@ -9,7 +11,8 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -61,17 +64,20 @@ class Optimisation(ABC):
         first_step: int = 0,
         lr_share: float = 1.0,
         warm_up: float = 0.0,
+        maps_only: bool = False,
     ):
         self.avatar, self.training, self.seed, self.ledger = avatar, training, seed, ledger
         self.steps, self.views, self.first_step, self.warm_up = steps, views, first_step, warm_up
         config = avatar.config
-        groups = [
-            {"params": list(avatar.features.parameters()), "lr": config.lr_maps * lr_share, "weight_decay": 0.0},
-            {"params": list(avatar.decoder.parameters()), "lr": config.lr_decoder * lr_share, "weight_decay": 0.01},
-        ]
+        networks = [(avatar.decoder, config.lr_decoder)]
         if config.pose_residual:
-            encoder = list(avatar.encoder.parameters())
-            groups.append({"params": encoder, "lr": config.lr_encoder * lr_share, "weight_decay": 0.01})
+            networks.append((avatar.encoder, config.lr_encoder))
+        self._resting = [network for network, _ in networks] if maps_only else []
+        groups: list[dict[str, Any]] = [
+            {"params": list(avatar.features.parameters()), "lr": config.lr_maps * lr_share, "weight_decay": 0.0}
+        ]
+        for network, rate in networks if not maps_only else []:
+            groups.append({"params": list(network.parameters()), "lr": rate * lr_share, "weight_decay": 0.01})
         self.rates = [group["lr"] for group in groups]
         self.optimizer = torch.optim.AdamW(groups, fused=True)
         self.names = {id(p): name for name, p in avatar.named_parameters()}
@@ -100,7 +106,7 @@ class Optimisation(ABC):
         self._require_visible_pixels()
         self._restore()
         started_at = self.step
-        with progress.task(self.title, self.steps) as task:
+        with progress.task(self.title, self.steps) as task, self._networks_at_rest():
             task.advance(self.step)
             while True:
                 try:
@@ -121,6 +127,17 @@ class Optimisation(ABC):
                     self.save()
         self.ledger.offer(self.first_step + self.step, self.avatar, force=True)
         self.save()
+
+    @contextmanager
+    def _networks_at_rest(self) -> Iterator[None]:
+        """Without gradients of what is not optimised."""
+        for network in self._resting:
+            network.requires_grad_(False)
+        try:
+            yield
+        finally:
+            for network in self._resting:
+                network.requires_grad_(True)
 
     def _require_visible_pixels(self) -> None:
         shows = any((view.mask == MaskState.PERSON).any() for view in self.training.views)

@@ -24,20 +24,18 @@ class RefineConfig:
     """Weight of a generated pixel relative to an original one."""
     background: float = 1.0
     """Weight of the L1 to the background where the complete mask says that a hidden pixel shows no person."""
+    networks: bool = False
+    """Go on with the decoder and the residual's encoder too. The paper refines the canonical UV maps (sec. 3.4)."""
     lr_share: float = 1.0
     """Step sizes as a share of stage 1's."""
     warm_up: float = 0.1
     """Share of the steps over which step sizes rise: AdamW starts anew, and its first steps would undo stage 1."""
-    painted_share: float = 0.5
-    """Share of the steps that take a painted view where fewer of the views are painted; none is taken more than twice
-    as often as in turn."""
 
     def __post_init__(self) -> None:
         rules = [
             ("steps", self.steps >= 0, "0 or more"),
             ("lr_share", 0 < self.lr_share < float("inf"), "above 0"),
             ("warm_up", 0 <= self.warm_up <= 1, "0 to 1"),
-            ("painted_share", 0 <= self.painted_share <= 1, "0 to 1"),
             ("lpips_net", self.lpips_net in ("vgg", "alex", "squeeze"), "vgg, alex or squeeze"),
         ]
         for name in ("weight", "ssim", "lpips", "generated", "background"):

@@ -11,15 +11,9 @@ from ihbench.ledger import Ledger
 from ihbench.methods.inpainthuman.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.inpainting.crop_view import CropView, Inpainter, cut_view, with_frames
 from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
-from ihbench.methods.inpainthuman.inpainting.own_guess import painter_weight, with_own_guess
 from ihbench.methods.inpainthuman.inpainting.painted_view import PaintedView, paste_back
 from ihbench.methods.inpainthuman.inpainting.shown_view import turntable_view, with_known_surface
-from ihbench.methods.inpainthuman.inpainting.surface_need import (
-    SeenSurface,
-    distance_to_seen,
-    key_views,
-    seen_surface,
-)
+from ihbench.methods.inpainthuman.inpainting.surface_need import SeenSurface, key_views, seen_surface
 from ihbench.progress import Progress
 from ihbench.scene import MaskState, TrainingSet, TrainView
 
@@ -65,8 +59,8 @@ class Stage2:
             # the simple painters take their colours from whatever frame shows them
             given = crops if self.config.filler == "diffusion" else filmed
             painted = painter.inpaint(given, progress)[: len(crops)]
-            if self.config.context == "seen":
-                painted = [self._with_own_guess(*each, surface) for each in zip(crops, painted, strict=True)]
+            if self.config.context == "seen" and self.config.trust < 1:
+                painted = [self._with_own_guess(*each) for each in zip(crops, painted, strict=True)]
         with self.ledger.stage("silhouette"):
             silhouettes = [finder.complete(view, image) for view, image in zip(crops, painted, strict=True)]
         out = [
@@ -121,13 +115,11 @@ class Stage2:
         device = str(self.avatar.device)
         return silhouette_finder(self.config.silhouette, self.training.background, self.config.sam_weights, device)
 
-    def _with_own_guess(self, view: CropView, painted: NDArray[np.uint8], surface: SeenSurface) -> NDArray[np.uint8]:
-        if self.config.near == 0:
-            return painted
-        body = self.training.body
-        distance = distance_to_seen(body.pose(view.body_pose), body, view.camera, surface)
+    def _with_own_guess(self, view: CropView, painted: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Painted pixels, averaged with what the avatar shows there: the two err differently."""
         guess, _ = self.avatar.render(view.camera, view.body_pose, self.training.background)
-        return with_own_guess(painted, guess, painter_weight(distance, self.config.near), view.unknown)
+        mixed = self.config.trust * painted + (1 - self.config.trust) * 255 * guess
+        return np.where(view.unknown[..., None], np.rint(mixed), painted).astype(np.uint8)
 
     def _original(self, index: int) -> TrainView | None:
         return self.training.views[index] if index < len(self.training.views) else None

@@ -35,7 +35,6 @@ from ihbench.scene import MaskState, TrainingSet, TrainView
 from ihbench.views import LazyViews
 
 STATE = "stage3"
-MOST_OFTEN = 2  # times as often as in turn a painted view is taken at most: a few of them would be learned by heart
 
 
 def completed_view(
@@ -105,9 +104,8 @@ class Stage3(Optimisation):
             first_step=avatar.config.steps,
             lr_share=chosen.lr_share,
             warm_up=chosen.warm_up,
+            maps_only=not chosen.networks,
         )
-        made = [*sorted(self._painted), *range(n, self.views)]
-        self._made, self._as_filmed = made, [k for k in range(n) if k not in self._painted]
         self._targets = LazyViews(self._target, self.views, held=TARGETS_HELD)
         self._perceptual: Perceptual | None = None
 
@@ -126,18 +124,6 @@ class Stage3(Optimisation):
         said = [event["data"].get("what") for event in self.ledger.events if event["kind"] == "left_out"]
         if what not in said:
             self.ledger.event("left_out", what=what, reason=reason)
-
-    def _view_of(self, step: int, n: int) -> int:
-        """Painted views take their share of the steps, evenly spread; among themselves either kind takes turns."""
-        made, filmed = self._made, self._as_filmed
-        if not made or not filmed:
-            return super()._view_of(step, n)
-        in_turn = len(made) / n
-        share = max(in_turn, min(self.config.painted_share, MOST_OFTEN * in_turn))
-        before, after = int(step * share), int((step + 1) * share)
-        if after > before:
-            return made[super()._view_of(before, len(made))]
-        return filmed[super()._view_of(step - before, len(filmed))]
 
     def _loss(self, k: int) -> Tensor:
         target, background = self._targets[k], self.training.background

@@ -296,7 +296,7 @@ def test_cleared_background_pulls_in_what_spills_behind_the_occluder():
         with torch.no_grad():
             avatar.decoder.linear[-1].bias[3] += 0.7
         before = avatar.render(view.camera, view.body_pose)[1][off].sum()
-        config = replace(REFINE, steps=25, background=weight, ssim=0.0, lr_share=1.0)
+        config = replace(REFINE, steps=25, background=weight, ssim=0.0, lr_share=1.0, networks=True)
         Stage3(avatar, training_set([view]), [painting], 0, Ledger(), config).run(Progress.silent())
         spill[weight] = avatar.render(view.camera, view.body_pose)[1][off].sum() / before
     assert spill[1.0] < 0.75
@@ -347,7 +347,8 @@ def test_the_residual_stays_as_stage_one_left_it(views, painted, on):
     avatar = an_avatar(residual_start=0.0)
     avatar.residual_on = on
     before = parameters_of(avatar)
-    Stage3(avatar, training_set(views), painted, 0, Ledger(), replace(REFINE, steps=2)).run(Progress.silent())
+    config = replace(REFINE, steps=2, networks=True)
+    Stage3(avatar, training_set(views), painted, 0, Ledger(), config).run(Progress.silent())
     assert avatar.residual_on is on
     changed = any(not torch.equal(before[name], p) for name, p in avatar.named_parameters() if "encoder" in name)
     assert changed is on
@@ -360,36 +361,28 @@ def test_the_configuration_is_the_avatars_own(views, painted):
 
 def test_step_sizes_are_a_share_of_stage_ones_rise_and_fall_along_a_cosine(views):
     avatar = an_avatar(steps=7, lr_final=0.1)
-    chosen = replace(REFINE, steps=4, lr_share=0.3, warm_up=0.5)
+    chosen = replace(REFINE, steps=4, lr_share=0.3, warm_up=0.5, networks=True)
     stage = Stage3(avatar, training_set(views[:1]), [], 0, Ledger(), chosen)
     rates = []
     step = stage.optimizer.step
     stage.optimizer.step = lambda: rates.append([group["lr"] for group in stage.optimizer.param_groups]) or step()
     stage.run(Progress.silent())
     config = avatar.config
+    assert config.pose_residual
     expected = 0.3 * (0.1 + 0.9 * 0.5 * (1 + np.cos(np.pi * np.arange(4) / 4))) * [0.5, 1, 1, 1]
     np.testing.assert_allclose(rates, expected[:, None] * [config.lr_maps, config.lr_decoder, config.lr_encoder])
 
 
-@pytest.mark.parametrize(("share", "expected"), [(0.0, 10), (0.5, 10), (0.75, 15), (1.0, 20)])
-def test_painted_views_take_their_share_of_the_steps_and_every_view_its_turn(views, painted, share, expected):
-    """Three of six views are painted, so without a share of their own they take half of the steps."""
-    stage = Stage3(an_avatar(), training_set(views), painted, 0, Ledger(), replace(REFINE, painted_share=share))
-    order = [stage._view_of(step, 6) for step in range(20)]
-    assert len(views) == 6
-    assert sum(k in (1, 3, 5) for k in order) == expected
-    assert set(order) == (set(range(6)) if share < 1 else {1, 3, 5})
-    assert max(order.count(k) for k in (1, 3, 5)) - min(order.count(k) for k in (1, 3, 5)) <= 1
-    assert order == [stage._view_of(step, 6) for step in range(20)]
-
-
-def test_a_few_painted_views_are_not_learned_by_heart(views, painted):
-    """One of six views is painted: half of the steps would take it three times as often as in turn."""
-    config = replace(REFINE, painted_share=0.5)
-    stage = Stage3(an_avatar(), training_set(views), painted[:1], 0, Ledger(), config)
-    order = [stage._view_of(step, 6) for step in range(30)]
-    assert order.count(painted[0].index) == 10
-    assert len(set(order)) == 6
+@pytest.mark.parametrize("networks", [False, True])
+def test_the_maps_alone_are_refined_unless_the_networks_are_too(views, painted, networks):
+    avatar = shaken(an_avatar(), 0.05)
+    before = {name: p.detach().clone() for name, p in avatar.named_parameters()}
+    Stage3(avatar, training_set(views), painted, 0, Ledger(), replace(REFINE, steps=3, networks=networks)).run(
+        Progress.silent()
+    )
+    changed = {name.partition(".")[0] for name, p in avatar.named_parameters() if not torch.equal(p, before[name])}
+    assert changed - {"encoder"} == ({"features", "decoder"} if networks else {"features"})
+    assert all(p.requires_grad for p in avatar.parameters())
 
 
 # ---------------------------------------------------------------------------------------------------- LPIPS
@@ -609,7 +602,7 @@ def test_no_visible_pixel_is_said(views, painted):
     [
         {"steps": -1}, {"weight": -1.0}, {"ssim": -0.1}, {"lpips": float("nan")}, {"lpips_net": "vgg19"},
         {"generated": float("inf")}, {"background": -1.0}, {"lr_share": 0.0}, {"lr_share": float("nan")},
-        {"warm_up": 1.5}, {"painted_share": -0.1},
+        {"warm_up": 1.5},
     ],
     ids=str,
 )  # fmt: skip

@@ -78,9 +78,9 @@ class InpaintConfig:
     context: Literal["seen", "frame"] = "seen"
     """What the inpainter is shown besides visible pixels. "seen": hidden pixels whose surface another frame shows are
     drawn by the stage-1 avatar, and only what no frame shows is painted. "frame": the frame alone, as the paper."""
-    near: float = 0.03
-    """Metres from seen surface at which the stage-1 avatar's own guess counts as much as the painter's; nearer it
-    counts more, farther less. 0: the painter alone (the paper). With context "seen" only."""
+    trust: float = 0.6
+    """Weight of the painter's colours; the rest is the stage-1 avatar's own guess, which errs differently. 1: the
+    painter alone (the paper). With context "seen" only."""
     key_views: int = 40
     """Frames painted at most, chosen to see all of the surface that needs it; 0 for every frame that sees some."""
     turntable: int = 0
@@ -105,7 +105,7 @@ class InpaintConfig:
             ("sampler_steps", self.sampler_steps is None or 1 <= self.sampler_steps <= 1000, "1 to 1000"),
             ("noise", self.noise is None or 0 <= self.noise < float("inf"), "0 or more"),
             ("guidance", self.guidance is None or self.guidance >= 1, "1 or more"),
-            ("near", 0 <= self.near < float("inf"), "0 m or more"),
+            ("trust", 0 <= self.trust <= 1, "0 to 1"),
             ("key_views", self.key_views >= 0, "0 or more"),
             ("turntable", self.turntable >= 0, "0 or more"),
             (
@@ -156,4 +156,4 @@ OWN: dict[str, dict[str, Any]] = {
 LORA_OF_MINI = 1e-3  # step size: so few weights need longer steps
 
 QUICK_INPAINT = InpaintConfig()
-PAPER_INPAINT = InpaintConfig(ti_steps=1000, lora_steps=2000, near=0.0, key_views=0)
+PAPER_INPAINT = InpaintConfig(ti_steps=1000, lora_steps=2000, trust=1.0, key_views=0)

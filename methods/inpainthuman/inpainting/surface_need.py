@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, median_filter
-from scipy.spatial import KDTree
 
 from ihbench.body import Body
 from ihbench.body.uv import Texels, texel_table
@@ -32,7 +31,6 @@ class SeenSurface:
     views: NDArray[np.int32]  # [N] training views that show the texel un-occluded
     faced: tuple[NDArray[np.int64], ...]  # per training view: texels that are the nearest surface but hidden there
     map: NDArray[np.bool_]  # [R, R] seen; off the charts the nearest texel's value
-    distance: NDArray[np.float32]  # [R, R] m to seen surface in the rest pose, 0 where seen, inf if none is; likewise
 
     @property
     def unseen(self) -> NDArray[np.bool_]:
@@ -50,21 +48,11 @@ def seen_surface(training: TrainingSet, resolution: int) -> SeenSurface:
         state = view.mask[row, column]
         count += nearest & (state == MaskState.PERSON)
         faced.append(np.flatnonzero(nearest & (state == MaskState.UNKNOWN)))
-    seen = count > 0
-    points = texels.interpolate(body.v_template, body.faces)
-    distance = np.full(len(points), np.inf, np.float32)
-    if seen.any():
-        distance[:] = KDTree(points[seen]).query(points)[0]
-    return SeenSurface(texels, count, tuple(faced), _beyond_charts(texels, seen), _beyond_charts(texels, distance))
-
-
-def _beyond_charts(texels: Texels, values: NDArray) -> NDArray:
-    """[N] values of texels -> [R, R], off the charts the nearest texel's value."""
-    size = len(texels.mask)
-    flat = np.zeros(size**2, values.dtype)
-    flat[texels.index] = values
-    nearest = distance_transform_edt(~texels.mask, return_distances=False, return_indices=True)
-    return flat.reshape(size, size)[tuple(np.asarray(nearest))]
+    flat = np.zeros(resolution**2, bool)
+    flat[texels.index] = count > 0
+    seen = flat.reshape(resolution, resolution)
+    nearest_chart = distance_transform_edt(~texels.mask, return_distances=False, return_indices=True)
+    return SeenSurface(texels, count, tuple(faced), seen[tuple(np.asarray(nearest_chart))])
 
 
 def unseen_pixels(
@@ -74,47 +62,23 @@ def unseen_pixels(
     surface: SeenSurface,
 ) -> NDArray[np.bool_]:
     """[H, W] pixels on or beside the body whose nearest surface no training view shows."""
-    seen, on = _on_pixels(surface.map, vertices, body, camera)
-    if not on.any():
-        return on
-    out = median_filter(on & ~seen, size=3) & on  # a lone texel is not worth a painter
-    rows = np.flatnonzero(on.any(1))
-    band = BAND * (rows[-1] - rows[0] + 1)
-    return np.where(on, out, _beside(out, on) & (np.asarray(distance_transform_edt(~on)) <= band))
-
-
-def distance_to_seen(
-    vertices: NDArray[np.float64],  # [V, 3] m world, the posed body
-    body: Body,
-    camera: Camera,
-    surface: SeenSurface,
-) -> NDArray[np.float32]:
-    """[H, W] m, on the body at rest, from a pixel's nearest surface to the nearest that some view shows; inf where
-    the body is nowhere in the image."""
-    distance, on = _on_pixels(surface.distance, vertices, body, camera)
-    return _beside(distance, on) if on.any() else np.full(on.shape, np.inf, np.float32)
-
-
-def _on_pixels(
-    values: NDArray, vertices: NDArray[np.float64], body: Body, camera: Camera
-) -> tuple[NDArray, NDArray[np.bool_]]:
-    """[H, W] of a map [R, R] over the surface, as the camera sees it, 0 off the body; and where the body is."""
     raster = rasterize(camera.project(vertices), body.faces, camera.height, camera.width)
     on = raster.face >= 0
+    out = np.zeros(on.shape, bool)
+    if not on.any():
+        return out
     corners = body.uv[body.uv_faces[raster.face[on]]]
     uv = np.einsum("nk,nkd->nd", raster.bary[on], corners)
-    size = len(values)
+    size = len(surface.map)
     column = np.clip((uv[:, 0] * size).astype(int), 0, size - 1)
     row = np.clip(((1 - uv[:, 1]) * size).astype(int), 0, size - 1)
-    out = np.zeros(on.shape, values.dtype)
-    out[on] = values[row, column]
-    return out, on
-
-
-def _beside(values: NDArray, on: NDArray[np.bool_]) -> NDArray:
-    """Off `on` the value of the nearest pixel on it."""
+    out[on] = ~surface.map[row, column]
+    out = median_filter(out, size=3) & on  # a lone texel is not worth a painter
     nearest = distance_transform_edt(~on, return_distances=False, return_indices=True)
-    return values[tuple(np.asarray(nearest))]
+    distance = distance_transform_edt(~on)
+    rows = np.flatnonzero(on.any(1))
+    band = BAND * (rows[-1] - rows[0] + 1)
+    return np.where(on, out, out[tuple(np.asarray(nearest))] & (np.asarray(distance) <= band))
 
 
 def key_views(faced: Sequence[NDArray[np.int64]], needed: NDArray[np.bool_], most: int) -> list[int]:
