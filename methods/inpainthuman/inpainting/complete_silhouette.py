@@ -32,7 +32,10 @@ from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
 from ihbench.methods.inpainthuman.inpainting.part_map import smpl_parts
 from ihbench.methods.inpainthuman.inpainting.quiet_libraries import quiet_libraries
 
-RIM = 0.03  # of the body's height in the crop: how far inside and outside of the posed body the painted image decides
+RIM = 0.03  # of the body's height in the crop: how far outside of the posed body the painted image decides
+# of the body's height: farther inside it all is person. A fitted body is about so exact; people stand out from the model,
+# not in; and a hole in a neck costs more than a rim too wide
+CORE = 0.01
 DEEP = 0.02  # of the body's height: so far inside the person the colour is no mixture
 COVERAGE = 0.5  # share of a pixel above which it is person
 CONTRAST = 40  # grey levels (Euclidean, RGB) below which a person cannot be told from the background
@@ -169,7 +172,7 @@ def silhouette_finder(
 
 class _Rim:
     """Which unknown pixels of a view the painted image decides: those at most `reach` of the body's height outside
-    the posed body, and at most `RIM` inside it."""
+    the posed body, and at most `CORE` inside it."""
 
     def __init__(self, view: CropView, reach: float = RIM):
         self.view, body = view, view.body
@@ -177,7 +180,7 @@ class _Rim:
         self.height = int(rows[-1] - rows[0] + 1) if len(rows) else 0  # px
         self.outside = _distance(~body)  # [S, W] px to the body, infinite without one
         self.inside = _distance(body)  # [S, W] px to the body's rim, 0 off the body
-        self.core = view.unknown & (self.inside > self.pixels(RIM))
+        self.core = view.unknown & (self.inside > self.pixels(CORE))
         self.undecided = view.unknown & ~self.core & (self.outside <= self.pixels(reach))
 
     def pixels(self, share: float) -> float:
