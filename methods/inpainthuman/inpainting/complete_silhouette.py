@@ -33,8 +33,8 @@ from ihbench.methods.inpainthuman.inpainting.part_map import smpl_parts
 from ihbench.methods.inpainthuman.inpainting.quiet_libraries import quiet_libraries
 
 RIM = 0.03  # of the body's height in the crop: how far outside of the posed body the painted image decides
-# of the body's height: farther inside it all is person. A fitted body is about so exact; people stand out from the model,
-# not in; and a hole in a neck costs more than a rim too wide
+# of the body's height: farther inside it all is person. A fitted body is about so exact; people stand out from the
+# model, not in; and a hole in a neck costs more than a rim too wide
 CORE = 0.01
 DEEP = 0.02  # of the body's height: so far inside the person the colour is no mixture
 COVERAGE = 0.5  # share of a pixel above which it is person
