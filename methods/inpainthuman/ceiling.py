@@ -94,8 +94,6 @@ def ceiling(
 
 def with_truth(painted: PaintedView, true: TrainView, share: float) -> PaintedView:
     """The painted view with its generated pixels moved towards the true image, and with the true silhouette."""
-    if share == 0:
-        return painted
     view, made = painted.view, painted.generated
     mixed = view.image + share * (true.image.astype(np.float64) - view.image)
     image = np.where(made[..., None], np.rint(mixed), view.image).astype(np.uint8)

@@ -15,11 +15,9 @@ from ihbench.errors import BadInput
 
 if TYPE_CHECKING:
     from ihbench.methods.inpainthuman.ceiling import CeilingRow
-    from ihbench.metrics.statistics import Paired
 
 SUMMARY = "what InpaintHuman's runs would have reached with a better painter, up to one that knows the truth"
 REGIONS = ("hidden", "visible", "never_seen")
-STAGE1 = "stage 1 alone"
 
 
 @dataclass(frozen=True)
@@ -74,8 +72,9 @@ def _ceiling(chosen: CeilingOptions) -> int:
             told = ", ".join(f"{region} {_mean(row, region):.2f}" for region in REGIONS)
             progress.say(f"{result.scene} seed {result.identity['seed']}, {row.name}: {told}")
         runs = [_numbers(r, its_rows) for r, (_, its_rows) in zip(results, found, strict=False)]
-        numbers = {"title": _title(results), "runs": runs}
-        text = table(found, _title(results))
+        title = _title(results[: len(found)])
+        numbers = {"title": title, "runs": runs}
+        text = table(found, title)
         if chosen.out is not None:  # after every run: the next may take minutes
             write_text(chosen.out / "ceiling.md", text + "\n")
             write_json(chosen.out / "ceiling.json", numbers)
@@ -135,18 +134,16 @@ def _gain(own: Mapping[str, float], first: Mapping[str, float]) -> str:
         return "—"
     if len(both) == 1:
         return f"{own[both[0]] - first[both[0]]:+.2f}"
-    pair = _paired({s: own[s] for s in both}, {s: first[s] for s in both}).interval
+    from ihbench.metrics.statistics import paired_test
+
+    pair = paired_test({s: own[s] for s in both}, {s: first[s] for s in both}).interval
     return f"{pair.value:+.2f} [{pair.low:+.2f}, {pair.high:+.2f}]"
 
 
-def _paired(a: Mapping[str, float], b: Mapping[str, float]) -> Paired:
-    from ihbench.metrics.statistics import paired_test
-
-    return paired_test(a, b)
-
-
 def _decibels(value: float) -> str:
-    return "—" if math.isnan(value) else "∞" if math.isinf(value) else f"{value:.2f}"
+    from ihbench.metrics.identity import METRICS
+
+    return METRICS["psnr"].text(value)
 
 
 def _numbers(result: Any, rows: Sequence[CeilingRow]) -> dict[str, Any]:
