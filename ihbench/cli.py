@@ -8,7 +8,7 @@ import sys
 from importlib import import_module
 
 from ihbench import __version__, registry
-from ihbench.errors import BadInput
+from ihbench.errors import BadInput, Diverged
 
 COMMANDS = {
     "run": "fit a method under a protocol, score it, print the table (the main job)",
@@ -83,6 +83,11 @@ def main(argv: list[str] | None = None) -> int:
         if as_json:
             print(json.dumps({"status": "bad input", "error": str(error)}))
         return 2
+    except Diverged as outcome:  # outside of a recorded run
+        print(f"ihbench: {outcome}", file=sys.stderr)
+        if as_json:
+            print(json.dumps({"status": "diverged", "error": str(outcome)}))
+        return 1
     except KeyboardInterrupt:
         print("ihbench: interrupted; the same command continues where it stopped", file=sys.stderr)
         return 130

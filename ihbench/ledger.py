@@ -103,6 +103,7 @@ class Ledger:
             self._stages = _stages(state["stages"])
             self._total, self._total_cpu = state["seconds"], state["cpu_seconds"]
             self.events = list(state["events"])
+        self._earlier = len(self.events)  # of these: what happened before this process
         self._last, self._last_cpu = clock(), time.process_time()
         self._last_save, self._save_cost = self._last, 0.0
         self._due = quality_times.after(self.fit_seconds)
@@ -217,7 +218,8 @@ class Ledger:
         return self._clock() - self._last_save >= max(self.save_every, self._save_cost / SAVE_SHARE)
 
     def save_state(self, name: str, tensors: Mapping[str, Any], meta: Mapping[str, Any]) -> None:
-        """Keep tensors (torch or numpy, any shape) and JSON-able `meta`, with the clock, as checkpoint `name`.
+        """Keep tensors (torch or numpy, any shape) and JSON-able `meta`, with the clock and the events so far, as
+        checkpoint `name`.
 
         The file `checkpoints/<name>.safetensors` is replaced whole. The time is booked under `checkpoint`. Raises
         `BadInput` when the disk is full, `ValueError` for a name that is no plain file name.
@@ -229,7 +231,8 @@ class Ledger:
             if self.folder is None:
                 self._in_memory[name] = _copies(tensors), {"meta": encode(dict(meta)), "clock": self._clocks()}
             else:
-                data = _pack(tensors, {"meta": encode(dict(meta)), "clock": self._clocks()})
+                events = {"of": self.folder.name, "events": self.events}
+                data = _pack(tensors, {"meta": encode(dict(meta)), "clock": self._clocks(), **encode(events)})
                 write_bytes(self._state_path(name), data)
         self._last_save = self._clock()
         self._save_cost = self._last_save - start
@@ -238,8 +241,9 @@ class Ledger:
         """Tensors (as they were: torch on the CPU, or numpy) and meta of checkpoint `name`, or None if there is none.
 
         The fit clock goes on from where it stood when the state was saved (the latest, when several are loaded): work
-        that a kill threw away is booked under `redone`. A file that is truncated or damaged counts as absent, and an
-        event says so.
+        that a kill threw away is booked under `redone`. Events that the kill took from the record come back, but not
+        from a state that another run has lent. A file that is truncated or damaged counts as absent, and an event
+        says so.
         """
         if not STATE_NAME.fullmatch(name):
             raise ValueError(f"checkpoint name: expected letters, digits and _.+-, got {name!r}")
@@ -259,8 +263,17 @@ class Ledger:
                 except Exception as error:  # whatever a damaged file makes of the reader: the stage starts again
                     self.event("warning", what=f"checkpoint {name} is damaged, starting that stage again: {error}")
                     return None
+                if record.get("of") == self.folder.name:
+                    self._recall(decode(record["events"]))
         self._go_on_from(clocks)
         return tensors, decode(record["meta"])
+
+    def _recall(self, events: list[dict[str, Any]]) -> None:
+        """Put events of an earlier process, as far as they are not known, before those of this one."""
+        known = [encode(event) for event in self.events]  # encoded, NaN equals itself
+        lost = [event for event in events if encode(event) not in known]
+        self.events[self._earlier : self._earlier] = lost
+        self._earlier += len(lost)
 
     def _state_path(self, name: str) -> Path:
         assert self.folder is not None

@@ -202,10 +202,10 @@ class _Run(RecordedRun):
             measure=asdict(measure),
             hidden_share=scene.hiding.hidden_share(),
         )
-        self.folder.set_status("running", ledger=self.ledger)
-        training = TrainingSet(scene.train, self.body, protocol.image.background, self.capture.name)
         if request.share:
             self._take_shared_states()
+        self.folder.set_status("running", ledger=self.ledger)
+        training = TrainingSet(scene.train, self.body, protocol.image.background, self.capture.name)
         with self.ledger.stage("fit"):
             avatar = method.fit(
                 training, device=request.device, seed=request.seed, ledger=self.ledger, progress=self.progress

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from ihbench import registry
+from ihbench.commands.device import check_device
 from ihbench.commands.parse import options
 from ihbench.commands.scene_choice import SceneChoice
 from ihbench.errors import BadInput
@@ -60,10 +61,7 @@ def _ablate(chosen: AblateOptions) -> int:
         raise BadInput(f"--seed {' '.join(map(str, chosen.seed))}: expected one number or more, each 0 or above")
     if chosen.workers is not None and chosen.workers < 0:
         raise BadInput(f"--workers {chosen.workers}: expected 0 or more")
-    if chosen.device == "cuda":
-        from ihbench.commands.run import require_cuda
-
-        require_cuda()
+    check_device(chosen.device)
     progress = Progress()
     ladder = _ladder(chosen)
     cells = _cells(chosen, ladder, progress)

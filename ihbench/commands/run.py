@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from ihbench import registry
+from ihbench.commands.device import check_device
 from ihbench.commands.parse import options
 from ihbench.commands.scene_choice import SceneChoice
 from ihbench.errors import BadInput
@@ -56,8 +57,7 @@ def _with_switches(method: str, profile: str) -> type[RunOptions]:
 
 
 def _run(chosen: Any) -> int:
-    if chosen.device == "cuda":
-        require_cuda()
+    check_device(chosen.device)
     from dataclasses import replace
 
     from ihbench.data_source import locate
@@ -102,11 +102,3 @@ def _check_keep(keep: tuple[str, ...], config: Any) -> None:
     for name in keep:
         if name not in known:
             raise BadInput(f"--keep {name}: no such switch: {registry.nearest(name, known)}")
-
-
-def require_cuda() -> None:
-    """Raises `BadInput` where there is no CUDA device."""
-    import torch
-
-    if not torch.cuda.is_available():
-        raise BadInput("--device cuda: torch sees no CUDA device here; leave --device out to fit on the CPU")

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from ihbench.commands.device import check_device
 from ihbench.errors import BadInput
 
 if TYPE_CHECKING:
@@ -54,10 +55,7 @@ def _ceiling(chosen: CeilingOptions) -> int:
         raise BadInput("ceiling: of which run? give one or more run folders")
     if not chosen.truth or not all(0 < share <= 1 for share in chosen.truth):
         raise BadInput(f"--truth {' '.join(map(str, chosen.truth))}: expected shares above 0, at most 1")
-    if chosen.device == "cuda":
-        from ihbench.commands.run import require_cuda
-
-        require_cuda()
+    check_device(chosen.device)
     results = [read_result(folder) for folder in chosen.run]
     groups = {result.group[:3] for result in results}
     if len(groups) > 1:

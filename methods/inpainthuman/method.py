@@ -30,10 +30,14 @@ class InpaintHuman:
             raise BadInput(f"scene {training.name}: no training view; nothing to fit")
         inpaint = self.config.inpaint
         with ledger.stage("fit/prepare"):
-            if inpaint.uses_diffusion and inpaint.weights:
+            if inpaint.uses_diffusion and inpaint.names_something:
                 from ihbench.methods.inpainthuman.inpainting.diffusion_inpainter import check_backbone
 
                 check_backbone(inpaint)
+            if inpaint.on and inpaint.silhouette == "sam":
+                from ihbench.methods.inpainthuman.inpainting.complete_silhouette import check_sam
+
+                check_sam(inpaint.sam_weights)
             betas = np.mean([view.body_pose.betas for view in training.views], axis=0)
             avatar = GaussianAvatar(self.config, training.body, betas, seed).to(device)
         with ledger.stage("fit/stage1"):

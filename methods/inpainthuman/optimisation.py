@@ -279,6 +279,7 @@ class Optimisation(ABC):
             self._first_bad = Diverged(*meta["first_bad"])
         if "good" in meta:
             named = {name.removeprefix("good."): v for name, v in tensors.items() if name.startswith("good.")}
-            self._good = _Good(meta["good"], {name: torch.as_tensor(v) for name, v in named.items()})
+            device = self.avatar.device
+            self._good = _Good(meta["good"], {n: torch.as_tensor(v).to(device) for n, v in named.items()})
         self._restored()
         self.ledger.event("resumed", stage=self.name, step=self.step)

@@ -40,7 +40,7 @@ class Stage2:
             surface = seen_surface(self.training, TEXELS)
             shown = self._shown(surface)
         if not shown:
-            return self._nothing()
+            return self._nothing("no training view hides surface that needs a painter")
         painter, size, square = self._painter()
         finder = self._silhouettes()  # before anything is learned: its weights may be missing
         body, views = self.training.body, self.training.views
@@ -48,13 +48,11 @@ class Stage2:
             crops = [cut_view(view, k, body, size, square) for k, view in shown.items()]
             crops = [crop for crop in crops if crop.unknown.any()]
             if not crops:  # what is asked lies outside of every crop
-                return self._nothing()
+                return self._nothing("what is hidden lies outside of every crop of the body")
             frames = [cut_view(views[k], k, body, size, square) for k in range(len(views))]
             filmed = with_frames(crops, frames)
         if self.config.filler == "diffusion":
             painter.learn(frames, progress)
-            for state, curve in painter.curves.items():
-                self.ledger.event("loss_curve", stage=state, steps=curve.steps[::5], losses=curve.losses[::5])
         with self.ledger.stage("inpaint"):
             # the simple painters take their colours from whatever frame shows them
             given = crops if self.config.filler == "diffusion" else filmed
@@ -67,13 +65,15 @@ class Stage2:
             paste_back(shown[view.index], view, image, silhouette, self._original(view.index))
             for view, image, silhouette in zip(crops, painted, silhouettes, strict=True)
         ]
+        if self.config.filler == "diffusion":
+            for state, curve in painter.curves.items():
+                self.ledger.event("loss_curve", stage=state, steps=curve.steps[::5], losses=curve.losses[::5])
         with self.ledger.stage("measure"):
             self._record(crops, filmed, painted, silhouettes)
         self._save(out)
         return out
 
-    def _nothing(self) -> list[PaintedView]:
-        reason = "every pixel's surface is shown by some training view; nothing to paint"
+    def _nothing(self, reason: str) -> list[PaintedView]:
         self.ledger.event("left_out", what="inpainting", reason=reason)
         self._save([])
         return []

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 
 from ihbench.errors import BadInput
@@ -35,28 +34,6 @@ from ihbench.scene import MaskState, TrainingSet, TrainView
 from ihbench.views import LazyViews
 
 STATE = "stage3"
-
-
-def completed_view(
-    index: int,
-    view: TrainView,
-    image: NDArray[np.uint8],  # [H, W, 3]; only its hidden pixels are taken
-    full: NDArray,  # [H, W] the complete person mask, non-zero for person; only its hidden pixels are taken
-) -> PaintedView:
-    """A training view whose every hidden pixel is believed: the original where it is visible, `image` elsewhere.
-
-    Raises `BadInput` for another size than the view's.
-    """
-    if image.shape != view.image.shape or full.shape != view.mask.shape:
-        raise BadInput(
-            f"completed view {index}: image {image.shape} and mask {full.shape}, expected {view.image.shape} and "
-            f"{view.mask.shape}, the training view's"
-        )
-    hidden = view.mask == MaskState.UNKNOWN
-    found = np.where(np.asarray(full) > 0, MaskState.PERSON, MaskState.BACKGROUND).astype(np.uint8)
-    shown = np.where(hidden[..., None], image, view.image)
-    mask = np.where(hidden, found, view.mask)
-    return PaintedView(index, TrainView(shown, mask, view.camera, view.body_pose, view.frame, view.camera_id), hidden)
 
 
 @dataclass(frozen=True)

@@ -419,3 +419,35 @@ def test_events_carry_both_clocks_and_survive_a_resume():
     expected = {"kind": "diverged", "fit_seconds": 2, "seconds": 3, "data": {"step": 9, "reason": "loss is NaN"}}
     assert ledger.events == [expected]
     assert Ledger(state=ledger.state()).events == [expected]
+
+
+def test_events_that_a_kill_took_from_the_record_come_back_with_the_state(tmp_path):
+    before = Ledger(tmp_path)
+    before.event("warning", what="told before the fit")
+    recorded = before.state()  # what run.json has
+    before.event("inpainted", drift=math.nan)
+    before.save_state("painted", {"a": np.zeros(1)}, {})
+    before.event("warning", what="never saved")
+
+    again = Ledger(tmp_path, state=recorded)
+    again.event("shared", state="stage1")
+    for _ in range(2):  # once is enough
+        again.load_state("painted")
+    assert [event["kind"] for event in again.events] == ["warning", "inpainted", "shared"]
+    assert math.isnan(again.events[1]["data"]["drift"])
+    again.save_state("refined", {"a": np.zeros(1)}, {})
+    third = Ledger(tmp_path, state=recorded)
+    third.load_state("painted")
+    third.load_state("refined")
+    assert [event["kind"] for event in third.events] == ["warning", "inpainted", "shared"]
+
+
+def test_a_lent_state_brings_no_events_of_its_lender(tmp_path):
+    lender = Ledger(tmp_path / "lender")
+    lender.event("warning", what="of the lender")
+    lender.save_state("stage1", {"a": np.zeros(1)}, {})
+    (tmp_path / "borrower").mkdir()
+    (tmp_path / "lender" / "checkpoints").rename(tmp_path / "borrower" / "checkpoints")
+    borrower = Ledger(tmp_path / "borrower")
+    assert borrower.load_state("stage1") is not None
+    assert borrower.events == []

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from ihbench.errors import BadInput
+from ihbench.errors import BadInput, Diverged
 from ihbench.ledger import Ledger
 from ihbench.methods.inpainthuman.inpainting import personalise
 from ihbench.methods.inpainthuman.inpainting.diffusion_inpainter import DiffusionInpainter
@@ -35,6 +35,19 @@ def learned(config, seed=0, views=None, ledger=None):
     painter = DiffusionInpainter(backbone, config, seed, ledger or Ledger())
     painter.learn(views or crops(HIDE), QUIET)
     return painter
+
+
+def lora_start(config, seed=0):
+    """LoRA's first factors as the adaptation finds them."""
+    starts = {}
+
+    class Spy(Personaliser):
+        def _optimise(self, state, what, named, *rest):
+            if state == personalise.ADAPT_STATE:
+                starts.update({n: p.detach().clone() for n, p in named.items() if "lora_A" in n})
+
+    Spy(tiny_backbone(), crops(HIDE), config, seed, Ledger()).run(QUIET)
+    return starts
 
 
 class TestSwitches:
@@ -87,14 +100,36 @@ class TestSwitches:
         painter.learn(crops(HIDE), QUIET)
         painter.inpaint(crops(HIDE), QUIET)
 
+    def test_lora_starts_alike_whether_or_not_a_word_was_learned(self):
+        starts = [lora_start(config) for config in (replace(TINY, tune="lora", ti=ti) for ti in (True, False))]
+        assert starts[0]
+        assert same(*starts)
+        assert not same(starts[0], lora_start(replace(TINY, tune="lora"), seed=7))
+
+    def test_the_text_encoder_learns_with_the_word_and_stops_with_it(self):
+        painter = learned(replace(TINY, text_lora=True))
+        now, plain = painter.backbone.text_encoder, weights(tiny_backbone().text_encoder)
+        after = {name.replace(".base_layer", ""): value for name, value in weights(now).items()}
+        added = {name: value for name, value in after.items() if "lora_B" in name}
+        assert added
+        assert all(value.any() for value in added.values())  # zero before the first step
+        assert all(torch.equal(after[name][: len(value)], value) for name, value in plain.items())
+        assert not any(p.requires_grad for p in now.parameters())
+        without = learned(TINY).inpaint(crops(HIDE), QUIET)
+        assert not images_equal(painter.inpaint(crops(HIDE), QUIET), without)
+
     def test_ti_gives_the_same_word_whether_or_not_lora_follows(self):
         alone = learned(replace(TINY, lora=False))
         with_lora = learned(TINY)
         a, b = alone.curves[personalise.TI_STATE], with_lora.curves[personalise.TI_STATE]
         assert a.losses == b.losses
 
-    def test_is_deterministic_by_seed(self):
-        a, b, c = learned(TINY), learned(TINY), learned(TINY, seed=1)
+    @pytest.mark.parametrize("tune", ["lora", "all"])
+    def test_is_deterministic_by_seed(self, tune):
+        config = replace(TINY, tune=tune)
+        a = learned(config)
+        torch.rand(7)  # what else draws random numbers does not matter
+        b, c = learned(config), learned(config, seed=1)
         assert images_equal(a.inpaint(crops(HIDE), QUIET), b.inpaint(crops(HIDE), QUIET))
         assert not images_equal(a.inpaint(crops(HIDE), QUIET), c.inpaint(crops(HIDE), QUIET))
 
@@ -119,8 +154,9 @@ class TestLearning:
 
     def test_a_view_that_is_all_hidden_is_left_out(self):
         shown, hidden = crops(HIDE)[:3], crops(slice(0, 64))[3:]
-        painter = learned(TINY, views=shown + hidden)
-        assert len(painter.inpaint(hidden, QUIET)) == 3
+        person = Personaliser(tiny_backbone(), shown + hidden, TINY, 0, Ledger())
+        assert person.views == shown
+        assert len(learned(TINY, views=shown + hidden).inpaint(hidden, QUIET)) == 3
 
     def test_nobody_visible_anywhere(self):
         with pytest.raises(BadInput, match="no frame shows a visible pixel"):
@@ -184,6 +220,67 @@ class TestTrouble:
             torch.equal(now[name.removeprefix("unet.")], v) for name, v in kept[0][1].items() if "unet." in name
         )
         assert len(steps) == 26
+        assert max(person.curves[personalise.ADAPT_STATE].steps) == 19
+
+    @pytest.mark.parametrize("spoiled", [20, 25, 30])  # where a copy is due, between two, and by the very last
+    def test_a_step_that_spoils_the_parameters_is_undone(self, monkeypatch, spoiled):
+        """The parameters that a step left behind count as good only once a loss of theirs was finite."""
+        backbone, ledger = tiny_backbone(), Ledger()
+        person = Personaliser(backbone, crops(HIDE), replace(TINY, ti=False, lora_steps=30), 0, ledger)
+        honest_step, honest_loss, asked = torch.optim.AdamW.step, person.loss, []
+
+        def loss(*args):
+            asked.append(0)
+            return honest_loss(*args)
+
+        def step(optimizer, *args, **kwargs):
+            honest_step(optimizer, *args, **kwargs)
+            if len(asked) == spoiled:
+                optimizer.param_groups[0]["params"][0].data.fill_(float("nan"))
+
+        monkeypatch.setattr(person, "loss", loss)
+        monkeypatch.setattr(torch.optim.AdamW, "step", step)
+        person.run(QUIET)
+        (event,) = [event for event in ledger.events if event["kind"] == "rolled_back"]
+        assert event["data"]["step"] == (0 if spoiled == 20 else 20)
+        assert all(torch.isfinite(value).all() for value in weights(backbone.unet).values())
+        assert all(torch.isfinite(value).all() for value in weights(backbone.controlnet).values())
+
+    def test_optimiser_out_of_memory_is_one_line(self, monkeypatch):
+        def step(*args, **kwargs):
+            raise torch.OutOfMemoryError("CUDA out of memory")
+
+        monkeypatch.setattr(torch.optim.AdamW, "step", step)
+        with pytest.raises(BadInput, match="textual inversion: one crop does not fit into memory"):
+            learned(TINY)
+
+    @pytest.mark.parametrize("limit", [2, 0])
+    def test_sampling_out_of_memory_halves_the_batch_then_says_what_to_do(self, monkeypatch, limit):
+        from ihbench.methods.inpainthuman.inpainting import sampling
+
+        honest, sizes = sampling.sample, []
+
+        def sample(backbone, batch, *args, **kwargs):
+            if len(batch) > limit:
+                raise torch.OutOfMemoryError("out of memory")
+            sizes.append(len(batch))
+            return honest(backbone, batch, *args, **kwargs)
+
+        config = replace(TINY, ti=False, lora=False, sg=False, batch=4)
+        expected = learned(config).inpaint(crops(HIDE), QUIET)
+        monkeypatch.setattr(sampling, "sample", sample)
+        if limit:
+            assert images_equal(learned(config).inpaint(crops(HIDE), QUIET), expected)
+            assert max(sizes) == limit
+        else:
+            with pytest.raises(BadInput, match=r"one crop of .* does not fit into memory"):
+                learned(config).inpaint(crops(HIDE), QUIET)
+
+    def test_a_painting_that_is_not_finite_is_a_divergence(self):
+        painter = DiffusionInpainter(tiny_backbone(), replace(TINY, ti=False, lora=False, sg=False), 0, Ledger())
+        painter.backbone.unet.conv_out.bias.data.fill_(float("inf"))
+        with pytest.raises(Diverged, match="not finite"):
+            painter.inpaint(crops(HIDE), QUIET)
 
     def test_out_of_memory_halves_the_batch_then_says_what_to_do(self, monkeypatch):
         ledger = Ledger()

@@ -15,7 +15,7 @@ from ihbench.methods.inpainthuman.inpainting.painted_view import PaintedView
 from ihbench.methods.inpainthuman.refine_config import RefineConfig
 from ihbench.methods.inpainthuman.refine_loss import PaintedTarget, load_perceptual, prepare_painted, refine_loss
 from ihbench.methods.inpainthuman.stage1 import draw, loss_of, prepare_target
-from ihbench.methods.inpainthuman.stage3 import Stage3, completed_view
+from ihbench.methods.inpainthuman.stage3 import Stage3
 from ihbench.metrics import psnr, ssim
 from ihbench.metrics.lpips import lpips, random_networks
 from ihbench.metrics.ssim import ssim_map
@@ -65,7 +65,9 @@ def painted(views):
 
 def true_painting(k, view):
     truth = train_view(view.camera, view.body_pose)
-    return completed_view(k, view, truth.image, truth.mask == MaskState.PERSON)
+    hidden = view.mask == MaskState.UNKNOWN
+    image = np.where(hidden[..., None], truth.image, view.image)
+    return PaintedView(k, replace(view, image=image, mask=np.where(hidden, truth.mask, view.mask)), hidden)
 
 
 def recoloured(painting, colour):
@@ -81,31 +83,6 @@ def refined(training, painted, seed=0, ledger=None, config=REFINE, **changes):
     avatar.residual_on = True
     Stage3(avatar, training, painted, seed, ledger or Ledger(), config).run(Progress.silent())
     return avatar
-
-
-# ------------------------------------------------------------------------------------------- completed views
-
-
-def test_a_completed_view_is_the_original_where_it_is_visible(views):
-    rng = np.random.default_rng(0)
-    view = views[1]
-    image, full = rng.integers(0, 256, view.image.shape).astype(np.uint8), rng.random(view.mask.shape) < 0.5
-    hidden = view.mask == MaskState.UNKNOWN
-    for given in (full, full.astype(np.uint8) * 255):
-        painting = completed_view(1, view, image, given)
-        assert np.array_equal(painting.generated, hidden)
-        assert np.array_equal(painting.view.image[~hidden], view.image[~hidden])
-        assert np.array_equal(painting.view.image[hidden], image[hidden])
-        assert np.array_equal(painting.view.mask[~hidden], view.mask[~hidden])
-        assert np.array_equal(painting.view.mask[hidden] == MaskState.PERSON, full[hidden])
-        assert not (painting.view.mask == MaskState.UNKNOWN).any()
-
-
-def test_a_completed_view_of_another_size_is_refused(views):
-    with pytest.raises(BadInput, match=r"completed view 1: .* expected \(64, 64, 3\)"):
-        completed_view(1, views[1], views[1].image[1:], views[1].mask[1:])
-    with pytest.raises(BadInput, match="completed view 1"):
-        completed_view(1, views[1], views[1].image, views[1].mask[:, 1:])
 
 
 # -------------------------------------------------------------------------------------------------- the loss

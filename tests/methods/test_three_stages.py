@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -40,16 +43,8 @@ def mini(tmp_path_factory):
 
 
 def config(weights, **inpaint) -> InpaintHumanConfig:
-    stage2 = replace(
-        QUICK.inpaint,
-        weights=str(weights),
-        ti_steps=3,
-        lora_steps=3,
-        batch=2,
-        sampler_steps=2,
-        key_views=2,
-        **inpaint,
-    )
+    small = dict(ti_steps=3, lora_steps=3, batch=2, sampler_steps=2, key_views=2)
+    stage2 = replace(QUICK.inpaint, weights=str(weights), **small | inpaint)
     return replace(TINY, inpaint=stage2, refine=replace(QUICK.refine, steps=4, lpips=0.0))
 
 
@@ -100,14 +95,60 @@ def test_every_simple_filler_runs_without_diffusers(filler, monkeypatch):
     assert [painter[0].name for painter in painters] == [filler]
 
 
+WHAT_IS_IMPORTED = """
+import sys
+from dataclasses import replace
+from ihbench.ledger import Ledger
+from ihbench.methods.inpainthuman.config import QUICK
+from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
+from ihbench.methods.inpainthuman.method import InpaintHuman
+from ihbench.methods.inpainthuman.stage1 import Stage1
+from ihbench.progress import Progress
+from tests.bench.fake_capture import a_camera, a_pose, train_view
+from tests.methods.tiny_fit import SIZE, TINY, training_set
+
+def told(when):
+    print(when, *(name for name in ("diffusers", "transformers") if name in sys.modules))
+
+honest = Stage1.run
+Stage1.run = lambda *a: (honest(*a), told("fitted"))
+inpaint = replace(InpaintConfig(), filler=sys.argv[1], weights=sys.argv[2], key_views=1, turntable=1)
+if inpaint.filler == "diffusion":
+    inpaint = replace(inpaint, ti=False, lora=False, sg=False)
+config = replace(TINY, steps=2, inpaint=inpaint, refine=replace(QUICK.refine, steps=1, lpips=0.0))
+views = [train_view(a_camera(0.0, SIZE), a_pose(0.1 * k, 0.1 * k), slice(28, 36), frame=k) for k in range(2)]
+InpaintHuman(config).fit(training_set(views), device="cpu", seed=0, ledger=Ledger(), progress=Progress.silent())
+told("painted")
+"""
+
+
+@pytest.mark.parametrize("filler", ["temporal", "diffusion"])
+def test_diffusers_is_imported_by_the_painter_that_needs_it(filler):
+    words = [sys.executable, "-c", WHAT_IS_IMPORTED, filler, ""]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=300, cwd=Path(__file__).parents[2])
+    loaded = " diffusers transformers" if filler == "diffusion" else ""
+    assert done.stdout.splitlines() == ["fitted", f"painted{loaded}"], done.stderr
+
+
+def test_looking_at_mini_weights_imports_no_diffusers(mini):
+    code = (
+        "import sys; from pathlib import Path\n"
+        "from ihbench.methods.inpainthuman.inpainting.mini_folder import check_mini\n"
+        f"check_mini(Path({str(mini)!r})); print('diffusers' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    assert done.stdout == "False\n", done.stderr
+
+
 class Killed(BaseException):
     pass
 
 
-@pytest.mark.parametrize("state", [TI_STATE, ADAPT_STATE, "stage2-painted", "stage3"])
+@pytest.mark.parametrize("state", [TI_STATE, ADAPT_STATE, "stage2-sampled", "stage2-painted", "stage3"])
 def test_killed_in_any_stage_and_resumed_ends_the_same(tmp_path, mini, state, monkeypatch):
     """Killed right after that state was saved; everything before it is not done again."""
-    whole = fit(config(mini))
+    given = config(mini, batch=1)
+    whole = fit(given)
     ledger = Ledger(tmp_path)
     monkeypatch.setattr(ledger, "due_to_save", lambda: True)
     honest = ledger.save_state
@@ -119,11 +160,14 @@ def test_killed_in_any_stage_and_resumed_ends_the_same(tmp_path, mini, state, mo
 
     monkeypatch.setattr(ledger, "save_state", save)
     with pytest.raises(Killed):
-        fit(config(mini), ledger)
+        fit(given, ledger)
     again = Ledger(tmp_path)
-    resumed = fit(config(mini), again)
+    resumed = fit(given, again)
     assert equal_bits(parameters_of(resumed), parameters_of(whole))
     assert state in [event["data"]["stage"] for event in again.events if event["kind"] == "resumed"]
+    assert sum(event["kind"] == "inpainted" for event in again.events) == 1  # nothing that was measured is lost
+    curves = [event["data"]["stage"] for event in again.events if event["kind"] == "loss_curve"]
+    assert sorted(curves) == sorted([TI_STATE, ADAPT_STATE])
 
 
 def test_the_miniature_of_stable_diffusion_2_goes_the_whole_way(tmp_path):
@@ -157,6 +201,19 @@ def test_wrong_weights_are_named_before_anything_is_fitted(tmp_path, monkeypatch
         fit(config(tmp_path, backbone="sd2"))
     with pytest.raises(BadInput, match="sam-weights ''"):
         config(tmp_path, silhouette="sam")
+    config(tmp_path, silhouette="sam", on=False)  # nobody needs them
+    with pytest.raises(BadInput, match=r"lacks config\.json"):
+        fit(config("", filler="mean", silhouette="sam", sam_weights=str(tmp_path)))
+    make_miniature(tmp_path / "sd2")
+    with pytest.raises(BadInput, match=r"control-weights .*no such folder"):
+        fit(config(tmp_path / "sd2", backbone="sd2", control_weights=str(tmp_path / "nowhere")))
+    for word, backbone, weights in (("person", "mini", ""), ("photo", "sd2", tmp_path / "sd2")):
+        with pytest.raises(BadInput, match=f"has '{word}' already"):
+            fit(config(weights, backbone=backbone, token=word))
+    for rate in ("ti_lr", "lora_lr", "control_lr"):
+        for value in (-1.0, 0.0, float("nan"), float("inf")):
+            with pytest.raises(BadInput, match=f"{rate.replace('_', '-')} .*: expected above 0"):
+                config("", **{rate: value})
     with pytest.raises(BadInput, match="weights ''"):
         config("", backbone="sd2")
 

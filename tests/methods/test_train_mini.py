@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 
 from ihbench.cli import main
 from ihbench.errors import BadInput
@@ -178,19 +179,61 @@ class TestWeights:
         with pytest.raises(BadInput, match="lacks unet, controlnet"):
             load_mini(tmp_path)
 
-    def test_a_damaged_file(self, tmp_path):
+    @pytest.mark.parametrize(
+        ("part", "change", "said"),
+        [
+            ("unet", lambda w: w.pop("conv_out.weight"), "tensors are missing (conv_out.weight)"),
+            ("text_encoder", lambda w: w.pop(next(n for n in w if "token_embedding" in n)), "1 of"),
+            ("codec", lambda w: w.pop("scale"), "tensors are missing (scale)"),
+            ("controlnet", lambda w: w.update(more=torch.ones(3)), "not of this model (more)"),
+            ("unet", lambda w: w.update({"conv_in.bias": torch.ones(3)}), "another shape (conv_in.bias"),
+            ("unet", lambda w: w["conv_in.bias"].fill_(float("nan")), "NaN or infinite"),
+        ],
+    )
+    def test_weights_are_never_made_up(self, tmp_path, part, change, said):
         save_mini(tiny_backbone(), tmp_path)
-        (tmp_path / "unet" / "diffusion_pytorch_model.safetensors").write_bytes(b"xx")
-        with pytest.raises(BadInput, match="not a readable mini backbone"):
+        (file,) = (tmp_path / part).glob("*.safetensors")
+        tensors = load_file(file)
+        change(tensors)
+        save_file(tensors, file)
+        with pytest.raises(BadInput) as caught:
+            load_mini(tmp_path)
+        assert said in str(caught.value)
+
+    @pytest.mark.parametrize("part", ["unet", "text_encoder", "tokenizer", "scheduler"])
+    def test_a_damaged_file(self, tmp_path, part):
+        save_mini(tiny_backbone(), tmp_path)
+        names = ("*.safetensors", "tokenizer.json", "scheduler_config.json")
+        (file,) = [file for name in names for file in (tmp_path / part).glob(name)]
+        file.write_bytes(b"xx")
+        with pytest.raises(BadInput, match=f"{part}.*not a (whole|readable)"):
             load_mini(tmp_path)
 
-    def test_weights_that_are_not_finite(self, tmp_path):
-        backbone = tiny_backbone()
-        with torch.no_grad():
-            next(backbone.unet.parameters()).fill_(float("nan"))
-        save_mini(backbone, tmp_path)
-        with pytest.raises(BadInput, match="not finite"):
+    def test_pickles_are_refused(self, tmp_path):
+        save_mini(tiny_backbone(), tmp_path)
+        (file,) = (tmp_path / "unet").glob("*.safetensors")
+        file.rename(file.with_suffix(".bin"))
+        with pytest.raises(BadInput, match="only pickles, which are refused"):
             load_mini(tmp_path)
+
+    @pytest.mark.parametrize(
+        ("part", "changes", "said"),
+        [
+            ("unet", {"in_channels": 9}, "in_channels is 9, expected 49"),  # Stable Diffusion's
+            ("unet", {"cross_attention_dim": 768}, "cross_attention_dim is 768, expected 128"),
+            ("controlnet", {"in_channels": 4}, "in_channels is 4, expected 24"),
+            ("codec", {"_class_name": "AutoencoderKL"}, "AutoencoderKL, expected BlockTransform"),
+            ("codec", {"luma": None}, "expected the numbers luma and chroma"),
+            ("text_encoder", {"vocab_size": 5}, "words, but the text encoder has 5"),
+        ],
+    )
+    def test_parts_of_another_model(self, tmp_path, part, changes, said):
+        save_mini(tiny_backbone(), tmp_path)
+        file = tmp_path / part / "config.json"
+        file.write_text(json.dumps(json.loads(file.read_text()) | changes))
+        with pytest.raises(BadInput) as caught:
+            load_mini(tmp_path)
+        assert said in str(caught.value)
 
 
 def test_the_command_trains_validates_and_writes_a_card(tmp_path, capsys, monkeypatch, album):

@@ -92,16 +92,14 @@ class Backbone:
         condition: Tensor,  # [B, 1 + C, h, w]
         text: Tensor,  # [B, L, D]
         parts: Tensor | None,  # [B, 3, H, W] part map in [0, 1]; None leaves the ControlNet out
-        guidance_scale: float = 1.0,
     ) -> Tensor:
         """What the scheduler's `prediction_type` says: noise, velocity or the clean latents."""
         noisy = noisy.to(self.dtype)  # the autoencoder may be kept in fp32
         residuals: dict[str, Any] = {}
         if parts is not None:
             down, middle = self.controlnet(
-                noisy, timesteps, encoder_hidden_states=text, controlnet_cond=parts.to(self.dtype), return_dict=False,
-                conditioning_scale=guidance_scale,
-            )  # fmt: skip
+                noisy, timesteps, encoder_hidden_states=text, controlnet_cond=parts.to(self.dtype), return_dict=False
+            )
             residuals = {"down_block_additional_residuals": down, "mid_block_additional_residual": middle}
         return self.unet(torch.cat([noisy, condition], 1), timesteps, encoder_hidden_states=text, **residuals).sample
 

@@ -95,6 +95,20 @@ def _shards(index: Path) -> list[Path]:
     return [index.parent / name for name in names]
 
 
+def empty_module(folder: Path, build: Callable[[], Any]) -> Any:
+    """A module with parameters on the meta device. Raises `BadInput` when the library rejects its configuration."""
+    from accelerate import init_empty_weights
+
+    try:
+        with init_empty_weights(include_buffers=False):
+            return build()
+    except Exception as error:  # the libraries raise all sorts for a bad value
+        first = str(error).strip().splitlines() or [type(error).__name__]
+        raise BadInput(
+            f"{folder / 'config.json'}: not a usable configuration ({first[0]}); fetch it again"
+        ) from error
+
+
 class UnreadModule:
     """A module whose tensors are still on disk; names and shapes are known to fit.
 
@@ -146,7 +160,8 @@ class UnreadModule:
             except (OSError, SafetensorError) as error:
                 raise _unreadable(file, error) from error
         self.module.load_state_dict(state, assign=True)
-        return self.module.to(device).eval().requires_grad_(False)
+        # for what is not stored; diffusers' own `to` warns of modules to be kept in float32, of which there are none
+        return nn.Module.to(self.module, device).eval().requires_grad_(False)
 
 
 def _checked(tensor: Tensor, file: Path, name: str, device: torch.device, dtype: torch.dtype) -> Tensor:

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from ihbench.errors import BadInput
 from ihbench.methods.inpainthuman.inpainting.checkpoint import has_pickles, read_json, weight_files
 from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
+from ihbench.methods.inpainthuman.inpainting.memory import said_when_full
 from ihbench.methods.inpainthuman.inpainting.part_map import smpl_parts
 from ihbench.methods.inpainthuman.inpainting.quiet_libraries import quiet_libraries
 
@@ -45,6 +46,8 @@ GRABCUT_ROUNDS = 2
 SAM_REACH = 0.1  # of the body's height: HQ-SAM's mask counts no farther off the body than this
 SAM_POINTS = 8
 SAM_OPTION = "--method.inpaint.sam-weights"
+SAM_FULL = "silhouette sam: too little free memory"
+SAM_SMALLER = "use --method.inpaint.silhouette coverage, or a smaller HQ-SAM"
 SAM_LAYOUT = (
     "expected HQ-SAM in transformers layout: config.json, preprocessor_config.json (or processor_config.json) and "
     "model.safetensors, as `hf download syscv-community/sam-hq-vit-huge` brings them"
@@ -143,7 +146,7 @@ class SamSilhouette:
         prompt = {
             name: inputs[name].to(self.device, number) for name in ("pixel_values", "input_points", "input_boxes")
         }
-        with torch.inference_mode():
+        with torch.inference_mode(), said_when_full(f"{SAM_FULL} on {self.device}; {SAM_SMALLER}"):
             # one mask: a box and points leave nothing ambiguous
             masks = self.model(**prompt, multimask_output=False).pred_masks.float().cpu()
         sizes = inputs["original_sizes"], inputs["reshaped_input_sizes"]
@@ -237,7 +240,8 @@ def _points_on_parts(parts: NDArray[np.uint8]) -> list[tuple[float, float]]:
     return points
 
 
-def _load_sam(weights: str, device: str) -> tuple[Any, Any]:
+def check_sam(weights: str) -> Path:
+    """The folder, after what a look can tell. Raises `BadInput`, see `SamSilhouette`."""
     folder = Path(weights).expanduser()
     if not weights or not folder.is_dir():
         raise BadInput(f"{SAM_OPTION} {weights!r}: no such folder; {SAM_LAYOUT}")
@@ -251,6 +255,11 @@ def _load_sam(weights: str, device: str) -> tuple[Any, Any]:
         raise BadInput(f"{SAM_OPTION} {folder}: {why}; {SAM_LAYOUT}")
     if not any((folder / f"{name}_config.json").is_file() for name in ("preprocessor", "processor")):
         raise BadInput(f"{SAM_OPTION} {folder}: lacks preprocessor_config.json; {SAM_LAYOUT}")
+    return folder
+
+
+def _load_sam(weights: str, device: str) -> tuple[Any, Any]:
+    folder = check_sam(weights)
     try:
         from transformers import SamHQModel, SamHQProcessor
     except ImportError as error:
@@ -273,4 +282,5 @@ def _load_sam(weights: str, device: str) -> tuple[Any, Any]:
         )
     if not all(p.isfinite().all() for p in model.parameters()):
         raise BadInput(f"{SAM_OPTION} {folder}: has NaN or infinite weights; fetch it again")
-    return model.to(device).eval().requires_grad_(False), processor
+    with said_when_full(f"{SAM_FULL} on {device}; {SAM_SMALLER}"):
+        return model.to(device).eval().requires_grad_(False), processor

@@ -13,7 +13,7 @@ from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
 from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
 from ihbench.methods.inpainthuman.inpainting.personalise import Curve, Personaliser
 from ihbench.methods.inpainthuman.inpainting.sampling import inpaint_views
-from ihbench.methods.inpainthuman.inpainting.subject_token import ANYBODY
+from ihbench.methods.inpainthuman.inpainting.subject_token import ANYBODY, new_words
 from ihbench.progress import Progress
 
 
@@ -30,15 +30,19 @@ def load_backbone(config: InpaintConfig, device: str) -> Backbone:
 
 
 def check_backbone(config: InpaintConfig) -> None:
-    """What `load_backbone` would complain of and a look at the folder can tell, before an hour of fitting."""
+    """Raises `BadInput` for what `load_backbone` and personalisation would complain of and a look at the folders can
+    tell, before an hour of fitting."""
     if config.backbone == "sd2":
-        from ihbench.methods.inpainthuman.inpainting.sd2_weights import check_sd2
+        from ihbench.methods.inpainthuman.inpainting.sd2_weights import look_at_sd2
 
-        check_sd2(config.weights)
-    elif config.weights:
-        from ihbench.methods.inpainthuman.inpainting.mini_weights import check_mini
+        tokenizer = look_at_sd2(config.weights, config.control_weights or None).tokenizer
+    else:
+        from ihbench.methods.inpainthuman.inpainting.mini_folder import SHIPPED, check_mini
+        from ihbench.methods.inpainthuman.inpainting.mini_weights import mini_tokenizer
 
-        check_mini(Path(config.weights))
+        tokenizer = mini_tokenizer(check_mini(Path(config.weights) if config.weights else SHIPPED)[0])
+    if config.ti:
+        new_words(tokenizer, config.token, config.settled().vectors, config.backbone)
 
 
 class DiffusionInpainter:
@@ -64,4 +68,5 @@ class DiffusionInpainter:
             self.backbone, views, self.prompt, progress,
             seed=self.seed, steps=settled.sampler_steps, use_parts=self.config.sg, guidance=settled.guidance,
             noise_scale=settled.noise, batch=self.config.batch,
+            ledger=self.ledger if self.ledger.folder is not None else None,
         )  # fmt: skip

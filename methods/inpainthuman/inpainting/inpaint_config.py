@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from ihbench.errors import BadInput
 
+TOKEN = "<someone>"
 Filler = Literal["diffusion", "mean", "telea", "navier-stokes", "push-pull", "mirror", "temporal"]
 
 
@@ -42,8 +43,9 @@ class InpaintConfig:
     lora: bool = True
     """Adapt the UNet to the person by painting visible pixels that were hidden on purpose (sec. 3.3)."""
     sg: bool = True
-    """Semantic guidance: the ControlNet on the body's part map, adapted together with the UNet (sec. 3.3)."""
-    token: str = "<someone>"
+    """Semantic guidance: the ControlNet on the body's part map, adapted together with the UNet (sec. 3.3). Wherever
+    the model is asked, also while the word is learned."""
+    token: str = TOKEN
     """The new word V*."""
     vectors: int | None = None
     """Word vectors of V*. None: 4 for mini, which was trained with so many; 1 for sd2, as in the paper."""
@@ -103,6 +105,7 @@ class InpaintConfig:
             ("rank", self.rank >= 1, "1 or more"),
             ("batch", self.batch >= 1, "1 or more"),
             ("sampler_steps", self.sampler_steps is None or 1 <= self.sampler_steps <= 1000, "1 to 1000"),
+            *((name, _rate(getattr(self, name)), "above 0") for name in ("ti_lr", "lora_lr", "control_lr")),
             ("noise", self.noise is None or 0 <= self.noise < float("inf"), "0 or more"),
             ("guidance", self.guidance is None or self.guidance >= 1, "1 or more"),
             ("trust", 0 <= self.trust <= 1, "0 to 1"),
@@ -114,7 +117,7 @@ class InpaintConfig:
                 '0 unless --method.inpaint.context is "seen"',
             ),
             ("token", bool(self.token.strip()) and " " not in self.token, "one word"),
-            ("sam_weights", self.silhouette != "sam" or bool(self.sam_weights), SAM_WANTED),
+            ("sam_weights", not self.on or self.silhouette != "sam" or bool(self.sam_weights), SAM_WANTED),
             ("weights", self.backbone != "sd2" or not self.uses_diffusion or bool(self.weights), SD2_WANTED),
         )
         for name, holds, expected in rules:
@@ -134,6 +137,15 @@ class InpaintConfig:
     @property
     def uses_diffusion(self) -> bool:
         return self.on and self.filler == "diffusion"
+
+    @property
+    def names_something(self) -> bool:
+        """Whether the user has named what may be wrong: weights, or a word."""
+        return bool(self.weights or self.control_weights) or self.token != TOKEN
+
+
+def _rate(value: float | None) -> bool:
+    return value is None or 0 < value < float("inf")
 
 
 SAM_WANTED = "the folder of HQ-SAM in transformers' layout, which silhouette sam needs"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +11,11 @@ import torch
 
 from ihbench.errors import BadInput
 from ihbench.methods.inpainthuman.inpainting.backbone import Backbone
-from ihbench.methods.inpainthuman.inpainting.block_transform import BlockTransform
+from ihbench.methods.inpainthuman.inpainting.checkpoint import UnreadModule, empty_module
+from ihbench.methods.inpainthuman.inpainting.mini_folder import SHIPPED, STEMS, check_mini
 from ihbench.methods.inpainthuman.inpainting.mini_model import SIZE
 from ihbench.methods.inpainthuman.inpainting.quiet_libraries import quiet_libraries
-
-SHIPPED = Path(__file__).parent / "mini"
-PARTS = ("unet", "controlnet", "text_encoder", "tokenizer", "codec", "scheduler")
+from ihbench.methods.inpainthuman.inpainting.text_encoder import unread_text_encoder
 
 
 def save_mini(backbone: Backbone, folder: Path) -> None:
@@ -32,47 +33,60 @@ def save_mini(backbone: Backbone, folder: Path) -> None:
     backbone.scheduler.save_pretrained(folder / "scheduler")
 
 
-def check_mini(folder: Path) -> Path:
-    """The folder, if it has every part."""
-    folder = Path(folder).expanduser()
-    missing = [name for name in PARTS if not (folder / name).is_dir()]
-    if missing:
-        raise BadInput(
-            f"{folder}: not a mini backbone, lacks {', '.join(missing)}; `ihbench train-mini --out DIR` makes one"
-        )
-    return folder
-
-
 def load_mini(folder: Path | None = None, device: str = "cpu") -> Backbone:
-    """The shipped backbone, or one that `ihbench train-mini` wrote. Raises `BadInput` for another folder."""
-    folder = check_mini(SHIPPED if folder is None else folder)
+    """The shipped backbone, or one that `ihbench train-mini` wrote, frozen. Raises `BadInput` for another folder, and
+    for weights that are damaged, missing, superfluous or not finite: none is made up."""
+    folder, configs = check_mini(SHIPPED if folder is None else folder)
     from diffusers import ControlNetModel, DDIMScheduler, UNet2DConditionModel
-    from transformers import AutoTokenizer, CLIPTextModel
 
-    given: dict[str, Any] = {"local_files_only": True, "use_safetensors": True, "torch_dtype": torch.float32}
+    from ihbench.methods.inpainthuman.inpainting.block_transform import BlockTransform
+
+    place = torch.device(device)
+
+    def part(name: str, kind: Any) -> Any:
+        with quiet_libraries():
+            module = empty_module(folder / name, lambda: kind.from_config(configs[name]))
+        return UnreadModule(module, folder / name, STEMS[name]).read(place, torch.float32)
+
+    tokenizer = mini_tokenizer(folder)
+    known = configs["text_encoder"].get("vocab_size")
+    if not isinstance(known, int) or len(tokenizer) > known:
+        raise BadInput(
+            f"{folder / 'tokenizer'}: {len(tokenizer)} words, but the text encoder has {known}; take both from one "
+            f"training"
+        )
+    with _readable(folder / "scheduler"):
+        scheduler: Any = DDIMScheduler.from_pretrained(folder / "scheduler")
+    return Backbone(
+        name="mini",
+        unet=part("unet", UNet2DConditionModel),
+        text_encoder=unread_text_encoder(folder / "text_encoder", configs["text_encoder"]).read(place, torch.float32),
+        tokenizer=tokenizer,
+        controlnet=part("controlnet", ControlNetModel),
+        codec=part("codec", BlockTransform),
+        scheduler=scheduler,
+        size=SIZE,
+        square=False,
+        prefill=True,
+    )
+
+
+def mini_tokenizer(folder: Path) -> Any:
+    """The tokenizer of a folder that `check_mini` has looked at. Raises `BadInput` for a damaged one."""
+    from transformers import AutoTokenizer
+
+    with _readable(folder / "tokenizer"):
+        return AutoTokenizer.from_pretrained(folder / "tokenizer", local_files_only=True)
+
+
+@contextmanager
+def _readable(folder: Path) -> Iterator[None]:
+    """Turns whatever a damaged file makes of the libraries' readers into one line."""
     try:
         with quiet_libraries():
-            backbone = Backbone(
-                name="mini",
-                unet=UNet2DConditionModel.from_pretrained(folder / "unet", **given),
-                text_encoder=CLIPTextModel.from_pretrained(
-                    folder / "text_encoder", local_files_only=True, use_safetensors=True
-                ).float(),
-                tokenizer=AutoTokenizer.from_pretrained(folder / "tokenizer", local_files_only=True),
-                controlnet=ControlNetModel.from_pretrained(folder / "controlnet", **given),
-                codec=BlockTransform.from_pretrained(folder / "codec", **given),
-                scheduler=DDIMScheduler.from_pretrained(folder / "scheduler"),
-                size=SIZE,
-                square=False,
-                prefill=True,
-            )
-    except Exception as error:  # whatever a damaged file makes of four libraries' readers
+            yield
+    except Exception as error:
         words = str(error).splitlines()
         raise BadInput(
-            f"{folder}: not a readable mini backbone ({words[0] if words else type(error).__name__})"
+            f"{folder}: not a readable part of a mini backbone ({words[0] if words else type(error).__name__})"
         ) from error
-    for name in ("unet", "controlnet", "text_encoder", "codec"):
-        part = getattr(backbone, name).to(device).eval().requires_grad_(False)
-        if not all(torch.isfinite(value).all() for value in part.state_dict().values()):
-            raise BadInput(f"{folder}/{name}: holds weights that are not finite; train it again")
-    return backbone

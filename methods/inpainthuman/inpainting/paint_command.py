@@ -8,8 +8,9 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+from ihbench.commands.device import check_device
 from ihbench.commands.scene_choice import ProtocolChanges
 from ihbench.errors import BadInput
 from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
@@ -30,8 +31,8 @@ class PaintOptions(ProtocolChanges):
     """Training frames painted, evenly spread; personalisation sees all."""
     seed: tuple[int, ...] = (0,)
     """Seeds; their scores are averaged per scene before anything else."""
-    device: str = "cpu"
-    """Where diffusion runs: cpu or cuda."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where diffusion runs."""
     profile: str = "quick"
     """quick or paper: the size of the images."""
     data: Path | None = None
@@ -62,6 +63,7 @@ def _paint(chosen: Any) -> int:
     from ihbench.progress import Progress
     from ihbench.protocol import load_protocol
 
+    check_device(chosen.device)
     for row in chosen.rows:
         if row not in ROWS:
             raise BadInput(f"--rows {row}: {registry.nearest(row, list(ROWS))}")

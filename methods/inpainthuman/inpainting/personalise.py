@@ -20,9 +20,9 @@ from ihbench.methods.inpainthuman.inpainting.backbone import Backbone, shrink_ma
 from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
 from ihbench.methods.inpainthuman.inpainting.diffusion_batch import batch_of, by_width
 from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
+from ihbench.methods.inpainthuman.inpainting.memory import ADVICE, out_of_memory
 from ihbench.methods.inpainthuman.inpainting.push_pull import push_pull
 from ihbench.methods.inpainthuman.inpainting.random_mask import SHARES, random_mask
-from ihbench.methods.inpainthuman.inpainting.sampling import out_of_memory
 from ihbench.methods.inpainthuman.inpainting.subject_token import ANYBODY, SubjectToken
 from ihbench.progress import Progress
 
@@ -41,6 +41,8 @@ LEAST_FRAMES = 4
 TI_STATE, ADAPT_STATE = "stage2-ti", "stage2-adapt"
 ATTENTION = ["to_q", "to_k", "to_v", "to_out.0"]
 TEXT_ATTENTION = ["q_proj", "k_proj", "v_proj", "out_proj"]
+
+Good = tuple[int, dict[str, Tensor]]  # steps taken, parameters by name
 
 
 @dataclass
@@ -86,9 +88,7 @@ class Personaliser:
         named: dict[str, nn.Parameter] = {"vectors": token.vectors}
         rates = {"vectors": self.settled.ti_lr}
         if config.text_lora:
-            encoder = self.backbone.text_encoder
-            encoder.add_adapter(_lora(config.rank, TEXT_ATTENTION))
-            added = _trainable(encoder, "text")
+            added = self._with_lora(self.backbone.text_encoder, TEXT_ATTENTION, "text", TI_STATE)
             named |= added
             rates |= {name: TEXT_LR for name in added}
         best = best_seen(self.views, config.ti_frames)
@@ -96,7 +96,8 @@ class Personaliser:
         self._optimise(
             TI_STATE, "textual inversion", named, rates, config.ti_steps, best, TI_SHARES, config.sg, progress
         )
-        token.vectors.requires_grad_(False)
+        for p in named.values():
+            p.requires_grad_(False)
 
     def _adapt(self, progress: Progress) -> None:
         config, backbone = self.config, self.backbone
@@ -104,10 +105,10 @@ class Personaliser:
         rates: dict[str, float] = {}
         if config.lora:
             if self.settled.tune == "lora":
-                backbone.unet.add_adapter(_lora(config.rank, ATTENTION))
+                added = self._with_lora(backbone.unet, ATTENTION, "unet", ADAPT_STATE)
             else:
                 backbone.unet.requires_grad_(True)
-            added = _trainable(backbone.unet, "unet")
+                added = _trainable(backbone.unet, "unet")
             named |= added
             rates |= {name: self.settled.lora_lr for name in added}
         if config.sg:
@@ -120,6 +121,18 @@ class Personaliser:
         )
         for p in named.values():
             p.requires_grad_(False)
+
+    def _with_lora(self, module: nn.Module, targets: list[str], prefix: str, state: str) -> dict[str, nn.Parameter]:
+        """Put LoRA of the configured rank into a frozen module. It starts from the run's seed alone, whatever else
+        has drawn random numbers. Its parameters, by name."""
+        from peft import LoraConfig, inject_adapter_in_model
+
+        rank = self.config.rank
+        lora = LoraConfig(r=rank, lora_alpha=rank, target_modules=targets, init_lora_weights="gaussian")
+        with torch.random.fork_rng(devices=[]):  # peft draws on the CPU
+            torch.manual_seed(int(np.random.default_rng((self.seed, *state.encode())).integers(2**62)))
+            inject_adapter_in_model(lora, module)
+        return _trainable(module, prefix)
 
     def _optimise(
         self,
@@ -143,7 +156,7 @@ class Personaliser:
             p.data = p.data.float()  # steps of 1e-5 are lost in half precision
         curve = self.curves.setdefault(state, Curve([], []))
         step, batch = self._restored(state, named, optimizer, curve), self.config.batch
-        good = (step, {name: p.detach().clone() for name, p in named.items()})
+        good: Good = (step, _copies(named))
         with progress.task(what, steps) as task:
             task.advance(step)
             while step < steps:
@@ -153,34 +166,40 @@ class Personaliser:
                 rng = np.random.default_rng((self.seed, *state.encode(), step))
                 try:
                     loss = self.loss(views, rng, batch, shares, use_parts)
+                    value = float("nan") if loss is None else loss.item()
                     if loss is not None and loss.requires_grad:
                         loss.backward()
+                    norm = _gradient_norm(named)
+                    fine = loss is None or (math.isfinite(value) and math.isfinite(norm))
+                    if loss is not None and fine:
+                        if step % GOOD_EVERY == 0:
+                            good = (step, _copies(named))  # a finite loss vouches for them
+                        torch.nn.utils.clip_grad_norm_(list(named.values()), 1.0)
+                        optimizer.step()
                 except (torch.OutOfMemoryError, MemoryError, RuntimeError) as error:
                     if not out_of_memory(error):
                         raise
                     if batch == 1:
                         raise BadInput(
-                            f"{what}: one crop does not fit into memory; use --method.inpaint.memory-lean or a "
-                            f"smaller backbone"
+                            f"{what}: one crop does not fit into memory; {ADVICE[self.backbone.name]}"
                         ) from error
                     batch = batch // 2
                     self.ledger.event("warning", what=f"{what}: out of memory at step {step}, batch now {batch}")
                     continue
-                value = float("nan") if loss is None else loss.item()
-                norm = _gradient_norm(named)
-                if loss is not None and not (math.isfinite(value) and math.isfinite(norm)):
-                    self._roll_back(named, good, f"{what}: loss {value}, gradient {norm} at step {step}", state)
+                if not fine:
+                    why = f"{what}: loss {value}, gradient {norm} at step {step}"
+                    self._roll_back(named, good, curve, why, state)
                     break
                 if loss is not None:
-                    torch.nn.utils.clip_grad_norm_(list(named.values()), 1.0)
-                    optimizer.step()
                     curve.steps.append(step)
                     curve.losses.append(value)
                 step += 1
                 task.advance()
-                if step % GOOD_EVERY == 0:
-                    good = (step, {name: p.detach().clone() for name, p in named.items()})
-                if self.ledger.due_to_save() and step < steps:
+                due = self.ledger.due_to_save() and step < steps
+                if (due or step == steps) and not _finite(named):  # no loss has seen this last step's outcome yet
+                    self._roll_back(named, good, curve, f"{what}: parameters not finite after step {step - 1}", state)
+                    break
+                if due:
                     self._save(state, step, named, optimizer, curve)
         self._save(state, steps, named, optimizer, curve)
         for p in named.values():
@@ -219,10 +238,10 @@ class Personaliser:
         per_crop = (error * channel_weight(backbone) * weight).sum((1, 2, 3)) / weight.sum((1, 2, 3)).clamp(min=1)
         return (per_crop / latents.shape[1] * timestep_weight(backbone, timesteps)).mean()
 
-    def _roll_back(
-        self, named: dict[str, nn.Parameter], good: tuple[int, dict[str, Tensor]], why: str, state: str
-    ) -> None:
+    def _roll_back(self, named: dict[str, nn.Parameter], good: Good, curve: Curve, why: str, state: str) -> None:
         step, values = good
+        kept = sum(n < step for n in curve.steps)
+        del curve.steps[kept:], curve.losses[kept:]
         with torch.no_grad():
             for name, p in named.items():
                 p.copy_(values[name])
@@ -303,12 +322,14 @@ def _trainable(module: nn.Module, prefix: str) -> dict[str, nn.Parameter]:
     return {f"{prefix}.{name}": p for name, p in module.named_parameters() if p.requires_grad}
 
 
+def _copies(named: dict[str, nn.Parameter]) -> dict[str, Tensor]:
+    return {name: p.detach().clone() for name, p in named.items()}
+
+
+def _finite(named: dict[str, nn.Parameter]) -> bool:
+    return all(bool(torch.isfinite(p).all()) for p in named.values())
+
+
 def _gradient_norm(named: dict[str, nn.Parameter]) -> float:
     norms = [p.grad.norm() for p in named.values() if p.grad is not None]
     return float(torch.stack(norms).norm()) if norms else 0.0
-
-
-def _lora(rank: int, targets: list[str]) -> Any:
-    from peft import LoraConfig
-
-    return LoraConfig(r=rank, lora_alpha=rank, target_modules=targets, init_lora_weights="gaussian")

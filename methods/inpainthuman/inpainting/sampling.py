@@ -8,10 +8,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ihbench.errors import BadInput, Diverged
+from ihbench.ledger import Ledger
 from ihbench.methods.inpainthuman.inpainting.backbone import Backbone
 from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
 from ihbench.methods.inpainthuman.inpainting.diffusion_batch import DiffusionBatch, batch_of, by_width, shared_noise
+from ihbench.methods.inpainthuman.inpainting.memory import ADVICE, out_of_memory
 from ihbench.progress import Progress
+
+STATE = "stage2-sampled"
 
 
 @torch.no_grad()
@@ -74,17 +78,23 @@ def inpaint_views(
     guidance: float = 1.0,
     noise_scale: float = 1.0,
     batch: int = 8,
+    ledger: Ledger | None = None,
 ) -> list[NDArray[np.uint8]]:
     """One completed crop per view. A batch that does not fit into memory is halved; when a single crop does not fit,
-    `BadInput` says so. `Diverged` for a result that is not finite."""
+    `BadInput` says so. `Diverged` for a result that is not finite. With a run's ledger a killed call goes on behind
+    the last batch saved; the batches, and so the pixels, are those of a call that was not killed."""
     out: list[NDArray[np.uint8]] = [view.image for view in views]
-    todo = [view if view.unknown.any() else None for view in views]
-    with progress.task("inpainting", sum(view is not None for view in todo)) as task:
+    done = _restored(ledger, out)
+    todo = {k for k, view in enumerate(views) if view.unknown.any()}
+    with progress.task("inpainting", len(todo)) as task:
+        task.advance(len(done))
         for width, numbers in by_width(views).items():
             noise = noise_scale * shared_noise(backbone, seed, width)
-            rest = [k for k in numbers if todo[k] is not None]
+            rest = [k for k in numbers if k in todo]
             while rest:
                 now, rest = rest[:batch], rest[batch:]
+                if done.issuperset(now):
+                    continue
                 try:
                     painted = sample(
                         backbone, batch_of([views[k] for k in now], backbone.device), noise, prompt,
@@ -95,8 +105,8 @@ def inpaint_views(
                         raise
                     if batch == 1:
                         raise BadInput(
-                            f"inpainting: one crop of {width}×{backbone.size} px does not fit into memory; use "
-                            f"--method.inpaint.memory-lean or a smaller backbone"
+                            f"inpainting: one crop of {width}×{backbone.size} px does not fit into memory; "
+                            f"{ADVICE[backbone.name]}"
                         ) from error
                     batch, rest = max(batch // 2, 1), now + rest
                     continue
@@ -106,12 +116,19 @@ def inpaint_views(
                 for k, image in zip(now, pixels, strict=True):
                     out[k] = views[k].completed(image)
                 task.advance(len(now))
+                done.update(now)
+                if ledger is not None and ledger.due_to_save() and len(done) < len(todo):
+                    ledger.save_state(STATE, {f"{k}": out[k] for k in done}, {"step": len(done)})
     return out
 
 
-def out_of_memory(error: BaseException) -> bool:
-    """Whether an error says that memory ran out, on whatever device."""
-    words = str(error).lower()
-    return isinstance(error, torch.OutOfMemoryError | MemoryError) or (
-        "out of memory" in words or "can't allocate memory" in words
-    )
+def _restored(ledger: Ledger | None, out: list[NDArray[np.uint8]]) -> set[int]:
+    """Put the crops that a killed call has saved into `out`; their numbers."""
+    saved = None if ledger is None else ledger.load_state(STATE)
+    if ledger is None or saved is None:
+        return set()
+    tensors, meta = saved
+    for k, image in tensors.items():
+        out[int(k)] = np.asarray(image)
+    ledger.event("resumed", stage=STATE, step=meta["step"])
+    return {int(k) for k in tensors}

@@ -17,7 +17,7 @@ by `from_pretrained`, which makes up what a file lacks and may ask the hub.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,15 +28,17 @@ from ihbench.methods.inpainthuman.inpainting.backbone import Backbone, LatentAut
 from ihbench.methods.inpainthuman.inpainting.checkpoint import (
     CONVERT,
     UnreadModule,
+    empty_module,
     find_folder,
     has_pickles,
     read_json,
     weight_files,
 )
+from ihbench.methods.inpainthuman.inpainting.memory import said_when_full
 from ihbench.methods.inpainthuman.inpainting.part_controlnet import new_controlnet
-from ihbench.methods.inpainthuman.inpainting.sampling import out_of_memory
+from ihbench.methods.inpainthuman.inpainting.text_encoder import TEXT_STEM, unread_text_encoder
 
-STEMS = {"unet": "diffusion_pytorch_model", "vae": "diffusion_pytorch_model", "text_encoder": "model"}
+STEMS = {"unet": "diffusion_pytorch_model", "vae": "diffusion_pytorch_model", "text_encoder": TEXT_STEM}
 OPTION, CONTROL_OPTION = "--method.inpaint.weights", "--method.inpaint.control-weights"
 LAYOUT = (
     "expected Stable Diffusion 2 inpainting in diffusers layout: unet/, vae/, text_encoder/ (config.json and "
@@ -52,12 +54,6 @@ ENCODER_SHAPE = (
     "block_out_channels", "down_block_types", "layers_per_block", "cross_attention_dim", "attention_head_dim",
     "use_linear_projection",
 )  # fmt: skip
-TEXT_FIELDS = (
-    "vocab_size", "hidden_size", "intermediate_size", "projection_dim", "num_hidden_layers", "num_attention_heads",
-    "max_position_embeddings", "hidden_act", "layer_norm_eps", "attention_dropout", "pad_token_id", "bos_token_id",
-    "eos_token_id",
-)  # fmt: skip
-TEXT_EXTRAS = ("vision_model.", "visual_projection.", "text_projection.", "logit_scale")  # of a whole CLIP
 OLD_ATTENTION = {
     "query": "to_q",
     "key": "to_k",
@@ -66,10 +62,36 @@ OLD_ATTENTION = {
 }  # VAE before diffusers 0.14
 
 
+@dataclass(frozen=True)
+class LookedAt:
+    """Weights that fit together by their configurations and headers; none of them is read yet."""
+
+    folder: Path
+    unet: UnreadModule
+    vae: UnreadModule
+    text_encoder: UnreadModule
+    controlnet: UnreadModule | None
+    base_unet: UnreadModule | None  # to make a ControlNet from
+    tokenizer: Any
+    scheduler: Any
+
+
+def look_at_sd2(weights: str, control: str | None = None) -> LookedAt:
+    """The folder or cached hub id `weights`, and the ControlNet of `control` or the UNet in its place, after
+    everything was checked that needs no weight to be read. Raises `BadInput`, see `load_sd2`."""
+    folder = find_folder(weights, OPTION)
+    _check_layout(folder)
+    configs = {part: read_json(folder / part / "config.json") for part in STEMS}
+    _check_model(folder, configs)
+    scheduler, tokenizer = _scheduler(folder), _tokenizer(folder, configs["text_encoder"])
+    unet, vae, text_encoder = _unread(folder, configs)
+    controlnet, base_unet = _unread_control(control, unet.module.config, vae.module.config)
+    return LookedAt(folder, unet, vae, text_encoder, controlnet, base_unet, tokenizer, scheduler)
+
+
 def load_sd2(
     weights: str,
     control: str | None = None,
-    base: str | None = None,
     *,
     device: torch.device | str,
     dtype: str = "auto",
@@ -77,40 +99,30 @@ def load_sd2(
 ) -> Backbone:
     """The backbone of the folder or cached hub id `weights`, frozen, on `device`.
 
-    The ControlNet is `control` (its folder), or made from the four-channel Stable Diffusion 2 UNet of `base`, or else
-    from the inpainting UNet. A `control` that holds such a UNet is taken for `base`. `dtype` is fp32, fp16, bf16, or
-    auto: on CUDA bf16, where it lacks that fp16, elsewhere fp32. A VAE with `force_upcast` (its default) stays in
-    fp32.
-    `memory_lean` checkpoints gradients, and has the VAE take one image at a time, large ones in tiles: slower, same
-    results within rounding.
+    The ControlNet is `control` (its folder), or made from the four-channel Stable Diffusion 2 UNet that `control`
+    holds, or else from the inpainting UNet. `dtype` is fp32, fp16, bf16, or auto: on CUDA bf16, where it lacks that
+    fp16, elsewhere fp32. A VAE with `force_upcast` (its default) stays in fp32. `memory_lean` checkpoints gradients,
+    and has the VAE take one image at a time, large ones in tiles: slower, same results within rounding.
 
     Raises `BadInput` for a folder that is incomplete, another model, pickled, cut short, inconsistent or not finite,
     and when the device has too little memory.
     """
     device = torch.device(device)
     number = _number_type(dtype, device)
-    folder, configs = check_sd2(weights)
-    scheduler, tokenizer = _scheduler(folder), _tokenizer(folder, configs["text_encoder"])
-    unet, vae, text_encoder = _unread(folder, configs)
-    controlnet, base_unet = _unread_control(control, base, unet.module.config, vae.module.config)
-    vae_number = torch.float32 if vae.module.config["force_upcast"] else number
-    try:  # part by part, so that no more than one is in memory twice
-        text_encoder = text_encoder.read(device, number)
-        vae = vae.read(device, vae_number)
-        if base_unet is not None:
-            controlnet = new_controlnet(base_unet.read(torch.device("cpu"), number), 4, device, number)
-            base_unet = None
-        unet = unet.read(device, number)
-        if controlnet is None:
+    found = look_at_sd2(weights, control)
+    vae_number = torch.float32 if found.vae.module.config["force_upcast"] else number
+    too_small = f"{OPTION} {found.folder}: {device} has too little free memory for these weights"
+    with said_when_full(f"{too_small}; free some, or use another GPU"):
+        # part by part, so that no more than one is in memory twice
+        text_encoder = found.text_encoder.read(device, number)
+        vae = found.vae.read(device, vae_number)
+        unet = found.unet.read(device, number)
+        if found.controlnet is not None:
+            controlnet = found.controlnet.read(device, number)
+        elif found.base_unet is not None:
+            controlnet = new_controlnet(found.base_unet.read(torch.device("cpu"), number), 4, device, number)
+        else:
             controlnet = new_controlnet(unet, 4, device, number)
-        elif isinstance(controlnet, UnreadModule):
-            controlnet = controlnet.read(device, number)
-    except (MemoryError, RuntimeError) as error:
-        if not out_of_memory(error):
-            raise
-        raise BadInput(
-            f"{OPTION} {folder}: {device} has too little free memory for these weights; free some, or use another GPU"
-        ) from error
     if memory_lean:
         _save_memory(unet, controlnet, vae)
     if device.type == "cuda":
@@ -118,16 +130,7 @@ def load_sd2(
             module.to(memory_format=torch.channels_last)
     codec = LatentAutoencoder(vae)
     size = int(unet.config["sample_size"] or 64) * codec.block
-    return Backbone("sd2", unet, text_encoder, tokenizer, controlnet, codec, scheduler, size, square=True)
-
-
-def check_sd2(weights: str) -> tuple[Path, dict[str, dict[str, Any]]]:
-    """The folder and its parts' configurations, after everything was checked that needs no weight to be read."""
-    folder = find_folder(weights, OPTION)
-    _check_layout(folder)
-    configs = {part: read_json(folder / part / "config.json") for part in STEMS}
-    _check_model(folder, configs)
-    return folder, configs
+    return Backbone("sd2", unet, text_encoder, found.tokenizer, controlnet, codec, found.scheduler, size, square=True)
 
 
 def _number_type(dtype: str, device: torch.device) -> torch.dtype:
@@ -227,24 +230,13 @@ def _check_sd2_unet(where: Path, unet: dict[str, Any]) -> None:
 
 def _unread(folder: Path, configs: dict[str, dict[str, Any]]) -> tuple[Any, Any, Any]:
     from diffusers import AutoencoderKL, UNet2DConditionModel
-    from transformers import CLIPTextConfig, CLIPTextModel
 
-    # only known fields: a configuration may also name code or files elsewhere
-    fields = {name: value for name, value in configs["text_encoder"].items() if name in TEXT_FIELDS}
-    unet = _empty(folder / "unet", lambda: UNet2DConditionModel.from_config(configs["unet"]))
-    vae = _empty(folder / "vae", lambda: AutoencoderKL.from_config(configs["vae"]))
-    text = _empty(folder / "text_encoder", lambda: CLIPTextModel(CLIPTextConfig(**fields)))
-    prefix = "text_model." if any(name.startswith("text_model.") for name in text.state_dict()) else ""
-
-    def text_name(stored: str) -> str | None:
-        if stored.startswith(TEXT_EXTRAS) or stored.endswith("position_ids"):
-            return None
-        return prefix + stored.removeprefix("text_model.")  # transformers 5 has dropped the prefix
-
+    unet = empty_module(folder / "unet", lambda: UNet2DConditionModel.from_config(configs["unet"]))
+    vae = empty_module(folder / "vae", lambda: AutoencoderKL.from_config(configs["vae"]))
     return (
         UnreadModule(unet, folder / "unet", STEMS["unet"]),
         UnreadModule(vae, folder / "vae", STEMS["vae"], _vae_name),
-        UnreadModule(text, folder / "text_encoder", STEMS["text_encoder"], text_name),
+        unread_text_encoder(folder / "text_encoder", configs["text_encoder"]),
     )
 
 
@@ -254,32 +246,16 @@ def _vae_name(stored: str) -> str:
     return f"{owner}.{OLD_ATTENTION[layer]}.{last}" if layer in OLD_ATTENTION else stored
 
 
-def _empty(folder: Path, build: Callable[[], Any]) -> Any:
-    """A module with parameters on the meta device. Raises `BadInput` when the library rejects its configuration."""
-    from accelerate import init_empty_weights
-
-    try:
-        with init_empty_weights(include_buffers=False):
-            return build()
-    except Exception as error:  # the libraries raise all sorts for a bad value
-        first = str(error).strip().splitlines() or [type(error).__name__]
-        raise BadInput(
-            f"{folder / 'config.json'}: not a usable configuration ({first[0]}); fetch it again"
-        ) from error
-
-
 def _unread_control(
-    control: str | None, base: str | None, unet: dict[str, Any], vae: dict[str, Any]
-) -> tuple[Any, UnreadModule | None]:
+    control: str | None, unet: dict[str, Any], vae: dict[str, Any]
+) -> tuple[UnreadModule | None, UnreadModule | None]:
     """The ControlNet of `control`, or the UNet to make one from; neither when neither is given. `unet` and `vae` are
     the configurations that it has to go with."""
     from diffusers import ControlNetModel, UNet2DConditionModel
 
-    if control and base:
-        raise BadInput(f"{CONTROL_OPTION}: give a ControlNet ({control}) or the base UNet ({base}), not both")
-    if not control and not base:
+    if not control:
         return None, None
-    folder = find_folder(str(control or base), CONTROL_OPTION)
+    folder = find_folder(control, CONTROL_OPTION)
     for part in ("unet", "controlnet"):
         if not (folder / "config.json").is_file() and (folder / part / "config.json").is_file():
             folder = folder / part
@@ -290,9 +266,9 @@ def _unread_control(
     kind = config.get("_class_name")
     if kind == "UNet2DConditionModel":
         _check_sd2_unet(where, config)
-        module = _empty(folder, lambda: UNet2DConditionModel.from_config(config))
-    elif kind == "ControlNetModel" and not base:
-        module = _empty(folder, lambda: ControlNetModel.from_config(config))
+        module = empty_module(folder, lambda: UNet2DConditionModel.from_config(config))
+    elif kind == "ControlNetModel":
+        module = empty_module(folder, lambda: ControlNetModel.from_config(config))
         colours, per_latent = (
             module.config["conditioning_channels"],
             _halvings("conditioning_embedding", module.config),

@@ -23,14 +23,7 @@ class SubjectToken(nn.Module):
     def __init__(self, backbone: Backbone, word: str, count: int, initial_word: str = "person"):
         super().__init__()
         tokenizer, encoder = backbone.tokenizer, backbone.text_encoder
-        self.words = [f"{word}-{k}" if k else word for k in range(count)]
-        known = tokenizer.get_vocab()
-        taken = [w for w in self.words if w in known]
-        if taken:
-            raise BadInput(
-                f"--method.inpaint.token {word}: the vocabulary of {backbone.name} has {taken[0]!r} already; choose "
-                f"a word that no prompt uses, such as <someone>"
-            )
+        self.words = new_words(tokenizer, word, count, backbone.name)
         first = initial_ids(tokenizer, initial_word)[0]
         tokenizer.add_tokens(self.words, special_tokens=True)
         ids = tokenizer.convert_tokens_to_ids(self.words)
@@ -56,6 +49,21 @@ class SubjectToken(nn.Module):
             here = (ids == self.ids[k])[..., None]
             out = torch.where(here, self.vectors[k].to(vectors.dtype), out)
         return out
+
+
+def new_words(tokenizer: Any, word: str, count: int, backbone: str) -> list[str]:
+    """The words of V*, one a vector. Raises `BadInput` for a word that the tokenizer of `backbone` already has: one
+    of its tokens, or what a prompt would speak of as one ("person", which CLIP lists as "person</w>")."""
+    words = [f"{word}-{k}" if k else word for k in range(count)]
+    vocabulary = tokenizer.get_vocab()
+    for new in words:
+        ids = tokenizer(new, add_special_tokens=False).input_ids
+        if new in vocabulary or (len(ids) == 1 and ids[0] != tokenizer.unk_token_id):
+            raise BadInput(
+                f"--method.inpaint.token {word}: the vocabulary of {backbone} has {new!r} already; choose a word "
+                f"that no prompt uses, such as <someone>"
+            )
+    return words
 
 
 def initial_ids(tokenizer: Any, word: str) -> list[int]:

@@ -6,8 +6,9 @@ import json
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+from ihbench.commands.device import check_device
 from ihbench.errors import BadInput
 from ihbench.methods.inpainthuman.inpainting.mini_training import MiniTraining
 
@@ -25,8 +26,8 @@ class TrainMiniOptions:
     """How it is trained."""
     start: Path | None = None
     """Folder of a mini backbone to go on from; by default training starts from random weights."""
-    device: str = "cpu"
-    """Where to train: cpu or cuda."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where to train."""
     json: bool = False
     """Print one JSON object on stdout and nothing else there."""
 
@@ -43,11 +44,13 @@ def main(argv: list[str]) -> int:
 def _train(chosen: Any) -> dict[str, Any]:
     from ihbench.data_source import cache_folder
     from ihbench.methods.inpainthuman.inpainting.mini_card import write_card
+    from ihbench.methods.inpainthuman.inpainting.mini_folder import SHIPPED
     from ihbench.methods.inpainthuman.inpainting.mini_validation import validate
-    from ihbench.methods.inpainthuman.inpainting.mini_weights import SHIPPED, save_mini
+    from ihbench.methods.inpainthuman.inpainting.mini_weights import save_mini
     from ihbench.methods.inpainthuman.inpainting.train_mini import MiniTrainer
     from ihbench.progress import Progress
 
+    check_device(chosen.device)
     if chosen.out.resolve() == SHIPPED.resolve():
         raise BadInput(f"--out {chosen.out}: holds the shipped backbone; train in a folder of your own")
     album = chosen.album or cache_folder() / "album"
