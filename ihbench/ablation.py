@@ -55,7 +55,8 @@ class Ladder:
 
 
 def grid(config: Any, vary: Mapping[str, Sequence[Any]]) -> Ladder:
-    """All combinations of the values of some switches; every one is compared with the first.
+    """All combinations of the values of some switches; every one is compared with the first. A value given twice
+    counts once.
 
     Raises `BadInput` for a switch that the configuration does not have, and for one without values.
     """
@@ -65,18 +66,31 @@ def grid(config: Any, vary: Mapping[str, Sequence[Any]]) -> Ladder:
             raise BadInput(f"--vary {name}: no such switch")
         if not values:
             raise BadInput(f"--vary {name}: expected a value or more")
-    rungs = []
-    for values in product(*vary.values()):
-        switches = dict(zip(vary, values, strict=True))
-        rungs.append(Rung(_name(switches), switches))
+    combinations = product(*(dict.fromkeys(values) for values in vary.values()))
+    grids = [dict(zip(vary, values, strict=True)) for values in combinations]
+    rungs = [Rung(name, switches) for name, switches in zip(_names(grids), grids, strict=True)]
     first = rungs[0].name
     comparisons = tuple(Comparison(f"{rung.name} instead of {first}", first, rung.name) for rung in rungs[1:])
     return Ladder(", ".join(vary), tuple(rungs), comparisons)
 
 
-def _name(switches: Mapping[str, Any]) -> str:
-    words = ", ".join(f"{name}={_plain(value)}" for name, value in switches.items())
-    return words if len(words) <= ROOM else words[: ROOM - 1] + "…"
+def _names(grids: Sequence[Mapping[str, Any]]) -> list[str]:
+    """One name a combination: what varies, cut to `ROOM`, with a number where that would make two alike."""
+    several = [name for name in grids[0] if len({_plain(switches[name]) for switches in grids}) > 1] or list(grids[0])
+    words = [", ".join(f"{name}={_plain(switches[name])}" for name in several) for switches in grids]
+    if all(len(text) <= ROOM for text in words):
+        return words
+    return [text if len(text) <= ROOM else f"{k + 1}: {text[: ROOM - 1]}…" for k, text in enumerate(words)]
+
+
+def kept(ladder: Ladder, rung: Rung, config: Any) -> tuple[str, ...]:
+    """Fields that the plan must leave as the rung has them: its own, and those by which rungs of the ladder differ,
+    as far as the rung has them at the profile's value (what differs from the profile stays anyway)."""
+    own, base = flat(configured(rung, config)), flat(config)
+    set_by_any = sorted({name for other in ladder.rungs for name in other.switches})
+    if "all" in rung.keep or any(other.keep for other in ladder.rungs):
+        return rung.keep  # a ladder about the plan itself
+    return (*rung.keep, *(name for name in set_by_any if own[name] == base[name]))
 
 
 def _plain(value: Any) -> str:

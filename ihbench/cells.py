@@ -75,6 +75,8 @@ def _in_this_process(cell: Cell) -> CellOutcome:
         return CellOutcome(cell, run_scene(cell.request, cell.source, cell.scene, Progress.silent()))
     except BadInput as error:
         return CellOutcome(cell, None, str(error))
+    except OSError as error:  # a folder that cannot be made, a disk that went away
+        return CellOutcome(cell, None, f"{type(error).__name__}: {error}")
 
 
 def _side_by_side(

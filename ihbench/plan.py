@@ -6,18 +6,15 @@ Nothing here imports torch or cv2: `ihbench plan` answers fast.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench.atomic import read_json
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera
-from ihbench.errors import BadInput
 from ihbench.occlusion import OcclusionPlan, apply_rule
 from ihbench.protocol import Protocol
 from ihbench.scene import BodyPose, Capture, MaskState
@@ -151,35 +148,3 @@ def _turn(roots: NDArray[np.float64]) -> float:  # [F, 3] rad
     _, _, basis = np.linalg.svd(axes[:, :, 1].mean(0)[None])  # the upright, then two axes across it
     across = axes[:, :, 2] @ basis[1:].T
     return float(np.rad2deg(np.ptp(np.unwrap(np.arctan2(across[:, 1], across[:, 0])))))
-
-
-def expected_seconds(runs: Path, method: str, profile: str) -> float | None:
-    """Median total seconds of finished runs of this method and profile under `runs`; None without any."""
-    seconds = [float(about["total_seconds"]) for about, _ in _finished(runs, method, profile)]
-    return float(np.median(seconds)) if seconds else None
-
-
-def stage_seconds(runs: Path, method: str, profile: str) -> dict[str, float]:
-    """Ledger path -> median seconds, over those finished runs of this method and profile that had the stage."""
-    found: dict[str, list[float]] = {}
-    for _, ledger in _finished(runs, method, profile):
-        for path, stage in ledger["stages"].items():
-            found.setdefault(path, []).append(float(stage["seconds"]))
-    return {path: float(np.median(seconds)) for path, seconds in found.items()}
-
-
-def _finished(runs: Path, method: str, profile: str) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
-    """`about` and ledger of the finished runs. A damaged record tells nothing about time and is passed over."""
-    for path in sorted(runs.glob("*/run.json")):
-        try:
-            record = read_json(path)
-            identity = record["identity"]
-            if record["status"] != "done" or (identity["method"], identity["profile"]) != (method, profile):
-                continue
-            about, ledger = record["about"], record["ledger"]
-            float(about["total_seconds"])
-            for stage in ledger["stages"].values():
-                float(stage["seconds"])
-        except (BadInput, AttributeError, KeyError, TypeError, ValueError):
-            continue
-        yield about, ledger

@@ -70,10 +70,12 @@ class RecordedRun(ABC):
     def describe(self, **more: Any) -> None:
         """Put the clocks, the peak memory, what the machine has turned out to be, and more into the record."""
         self.folder.record["machine"] = machine.identity_at_end(self.folder.record["machine"])
+        # an earlier process of this run, or the run that lent a stage, may have held more
+        stages = [row["peak_mb"] for row in self.ledger.table()]
         self.folder.record["about"] |= {
             "fit_seconds": self.ledger.fit_seconds,
             "total_seconds": self.ledger.seconds,
-            "peak_mb": machine.peak_memory_mb(),
+            "peak_mb": max([*stages, machine.peak_memory_mb()]),
         } | more
 
 

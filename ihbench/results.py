@@ -49,6 +49,12 @@ class RunResult:
         identity = self.identity
         return identity["protocol"], identity["protocol_digest"], identity["profile"], self.data
 
+    @property
+    def planned(self) -> dict[str, Any]:
+        """Switches that the plan has changed for this scene -> the value that was in force."""
+        omissions = self.record["about"].get("left_out", ())
+        return {o["field"]: o["value"] for o in omissions if o["value"] is not None}
+
     @cached_property
     def curve(self) -> list[dict[str, Any]]:
         """Quality-time points, see `RunFolder.add_curve_point`; none where there is no file, or a damaged one."""

@@ -226,7 +226,7 @@ class _Run(RecordedRun):
 
         states = getattr(registry.load("config", self.request.method), "SHARED_STATES", {})
         for state, free in states.items():
-            other = lender(self.request.runs, self.folder, state, free)
+            other = lender(self.request.runs, self.folder, state, free, machine.identity())
             if other is not None:
                 self.ledger.events.extend(lend(other, self.folder, state))  # that it went back, say
                 self.ledger.event("shared", state=state, run=other.record["digest"])
@@ -246,12 +246,18 @@ class _Run(RecordedRun):
 
 
 def _planned(request: RunRequest, measure: SceneMeasure) -> tuple[Any, list[Omission]]:
-    """The configuration without what the scene does not need, and what that was."""
+    """The configuration without what the scene does not need, and what that was. A switch that differs from the
+    profile was set by somebody, and stays."""
     left_out = absent_regions(measure, request.protocol.regions)
     if "all" in request.keep:
         return request.config, left_out
-    proposed = [o for o in registry.load("config", request.method).leave_out(request.config, measure)]
-    proposed = [o for o in proposed if o.field not in request.keep]
+    found = registry.load("config", request.method)
+    own, base = flat(request.config), flat(found.PROFILES[request.protocol.profile])
+    proposed = [
+        o
+        for o in found.leave_out(request.config, measure)
+        if o.field not in request.keep and own[o.field] == base[o.field]
+    ]
     return with_fields(request.config, {o.field: o.value for o in proposed}), proposed + left_out
 
 
@@ -279,12 +285,13 @@ def _outside(request: RunRequest) -> dict[str, str]:
     if not found:
         return {}
     digest = hashlib.sha256()
-    for folder in found:
-        for path in sorted(p for p in Path(folder).rglob("*") if p.is_file()):
+    for named_path in map(Path, found):
+        for path in [named_path] if named_path.is_file() else sorted(p for p in named_path.rglob("*") if p.is_file()):
             size = path.stat().st_size
             with path.open("rb") as file:  # both ends: whole weights of gigabytes would take minutes
                 ends = file.read(ENDS)
                 file.seek(max(size - ENDS, 0))
                 ends += file.read(ENDS)
-            digest.update(f"{path.relative_to(folder).as_posix()}\0{size}\0".encode() + ends)
+            inside = path.relative_to(named_path if named_path.is_dir() else named_path.parent)
+            digest.update(f"{inside.as_posix()}\0{size}\0".encode() + ends)
     return {"outside": digest.hexdigest()[:8]}

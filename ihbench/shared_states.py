@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +11,15 @@ from ihbench import atomic
 from ihbench.errors import BadInput
 from ihbench.store import RunFolder
 
+SAME_CLOCK = ("cpu", "gpu", "torch_threads")  # of a machine's identity: the state's seconds come with it
 
-def lender(runs: Path, borrower: RunFolder, state: str, free: Sequence[str]) -> RunFolder | None:
-    """A finished run under `runs` that has `state`, and whose identity differs from the borrower's at most in
-    configuration fields whose names begin with one of `free`; None when there is none, or nothing is missing."""
+
+def lender(
+    runs: Path, borrower: RunFolder, state: str, free: Sequence[str], here: Mapping[str, Any]
+) -> RunFolder | None:
+    """A finished run under `runs` that has `state`, was made on such a machine as `here` with as many threads, and
+    whose identity differs from the borrower's at most in configuration fields whose names begin with one of `free`;
+    None when there is none, or nothing is missing."""
     if _file(borrower.path, state).is_file():
         return None
     wanted = _key(borrower, free)
@@ -24,7 +29,9 @@ def lender(runs: Path, borrower: RunFolder, state: str, free: Sequence[str]) -> 
                 other = RunFolder.open(file.parent.parent)
             except BadInput:
                 continue  # a damaged record vouches for nothing
-            if other.status == "done" and _key(other, free) == wanted:
+            there = other.record.get("machine") or {}
+            alike = all(there.get(name) == here.get(name) for name in SAME_CLOCK)
+            if alike and other.status == "done" and _key(other, free) == wanted:
                 return other
     return None
 
@@ -55,8 +62,9 @@ def _file(folder: Path, state: str) -> Path:
 
 def _key(run: RunFolder, free: Sequence[str]) -> dict[str, Any]:
     identity = dict(run.identity)
-    identity["config"] = _without(identity["config"], free)
-    return identity
+    config = _without(identity["config"], free)
+    kept = [name for name in config.get("keep", ()) if not name.startswith(tuple(free))]
+    return identity | {"config": config | {"keep": kept}}
 
 
 def _without(config: dict[str, Any], free: Sequence[str], before: str = "") -> dict[str, Any]:

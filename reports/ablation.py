@@ -14,6 +14,7 @@ from ihbench.cells import CellOutcome
 from ihbench.metrics import Identity
 from ihbench.metrics.identity import Metric, metric_of
 from ihbench.metrics.statistics import Interval, holm, mean_interval, paired_test
+from ihbench.reports.clock import clock_notes, one_clock
 from ihbench.reports.significance import ALPHA, LEVEL, per_scene
 from ihbench.results import RunResult
 
@@ -66,7 +67,7 @@ def _table(ladder: Ladder, protocol: str, cells: Found) -> tuple[list[str], dict
         having = runs[rung.name]
         asked = sum(name == rung.name for name, _ in cells)
         scores = {i: _interval(per_scene(having, i)) for i in columns}
-        seconds = _interval(_seconds(having))
+        seconds = _interval(_seconds(having)) if one_clock(having) else None
         cells_shown = [_shown(scores[i], metric_of(i)) for i in columns] + [_whole(seconds)]
         cells_shown += [f"{rung.paper[m]:.{PAPER[m][1]}f}" if m in rung.paper else "" for m in quoted]
         counted = f"{len(having)}" if len(having) == asked else f"{len(having)} of {asked}"
@@ -78,14 +79,45 @@ def _table(ladder: Ladder, protocol: str, cells: Found) -> tuple[list[str], dict
             "asked": asked,
             "scores": {i: _numbers(interval) for i, interval in scores.items()},
             "fit_seconds": _numbers(seconds),
+            "left_out": _omissions(having),
             "paper": dict(rung.paper),
         }
+    lines += ["", *(f"- {note}" for note in [*_left_out(runs), *clock_notes(_timed(runs))])]
     told, compared = _comparisons(ladder.comparisons, runs, columns)
     if quoted:
         lines += ["", "The paper's numbers are quoted: its own data, whole images, LPIPS* = 1000 × LPIPS."]
     if told:
         lines += ["", "What each component is worth (paired over scenes, mean over seeds):", "", *told]
     return lines, {"protocol": protocol, "headline": headline, "rungs": rungs, "comparisons": compared}
+
+
+def _omissions(runs: Sequence[RunResult]) -> dict[str, int]:
+    """What the plan left out -> in how many of the runs."""
+    count: dict[str, int] = {}
+    for run in runs:
+        for o in run.record["about"].get("left_out", ()):
+            if o["value"] is not None:
+                text = f"{o['field']} → {_plain_text(o['value'])}"
+                count[text] = count.get(text, 0) + 1
+    return count
+
+
+def _left_out(runs: Mapping[str, Sequence[RunResult]]) -> list[str]:
+    """A line for each rung that the plan has changed."""
+    lines = []
+    for rung, having in runs.items():
+        omissions = [f"{what} in {n} of {len(having)} runs" for what, n in _omissions(having).items()]
+        if omissions:
+            lines.append(f"left out by the plan, {rung}: {'; '.join(omissions)}")
+    return lines
+
+
+def _timed(runs: Mapping[str, Sequence[RunResult]]) -> dict[str, list[RunResult]]:
+    """Rung -> its runs that have a clock."""
+    timed = {
+        rung: [r for r in having if r.record["about"].get("fit_seconds") is not None] for rung, having in runs.items()
+    }
+    return {rung: having for rung, having in timed.items() if having}
 
 
 def _columns(runs: Sequence[RunResult], headline: str) -> list[str]:
@@ -106,15 +138,19 @@ def _comparisons(
     """A table of differences, p adjusted over a column's comparisons; and the numbers."""
     found: list[dict[str, Any]] = []
     for comparison in wanted:
-        before, after = runs[comparison.without], runs[comparison.having]
+        before, after = _of_both(runs[comparison.without], runs[comparison.having])
         row: dict[str, Any] = {"what": comparison.what, "without": comparison.without, "with": comparison.having}
         row["scores"] = {i: _paired(per_scene(after, i), per_scene(before, i)) for i in columns}
-        row["fit_seconds"] = _paired(_seconds(after), _seconds(before))
+        alike = one_clock([*before, *after])
+        row["fit_seconds"] = _paired(_seconds(after), _seconds(before)) if alike else None
         found.append(row)
+    impossible = []
     for i in columns:
-        tested = [row["scores"][i] for row in found if row["scores"][i] is not None]
+        tested = [row["scores"][i] for row in found if row["scores"][i] is not None and row["scores"][i]["n"] > 1]
         for pair, p in zip(tested, holm([pair["p"] for pair in tested]), strict=True):
             pair["p_adjusted"] = p
+        if tested:  # the smallest p is multiplied by the number of tests
+            impossible.append(len(tested) * min(pair["smallest_p"] for pair in tested))
     found = [row for row in found if any(row["scores"].values())]
     if not found:
         return [], []
@@ -127,20 +163,40 @@ def _comparisons(
         n = max(pair["n"] for pair in row["scores"].values() if pair)
         cells = [_difference(row["scores"][i], metric_of(i)) for i in columns]
         seconds = row["fit_seconds"]
-        cells.append("" if seconds is None else f"{seconds['mean']:+.0f}")
+        cells.append("—" if seconds is None else f"{seconds['mean']:+.0f}")
         lines.append(f"| {row['what']} | {n} | " + " | ".join(cells) + " |")
-    smallest = max((pair["smallest_p"] for row in found for pair in row["scores"].values() if pair), default=math.nan)
-    lines += ["", f"[{LEVEL:.0%} interval]; * better or worse with p < {ALPHA} (sign-flip test, Holm over the rows)."]
-    if smallest >= ALPHA:
-        lines.append(f"With so few scenes no p can be below {smallest:.2g}, so nothing can be marked.")
+    if impossible:
+        lines += [
+            "",
+            f"[{LEVEL:.0%} interval]; * better or worse with p < {ALPHA} (sign-flip test, Holm over the rows).",
+        ]
+        if min(impossible) >= ALPHA:
+            lines.append(
+                f"With so few scenes for so many comparisons no adjusted p can be below {min(impossible):.2g}, so "
+                f"nothing can be marked: read the intervals, or ask less with --vary."
+            )
+    else:
+        lines += ["", "One scene: differences have no interval and no test."]
     return lines, found
 
 
-def _paired(a: Mapping[str, float], b: Mapping[str, float]) -> dict[str, float | int | str] | None:
-    """The first minus the second over the scenes of both; None with fewer than two."""
+def _of_both(a: Sequence[RunResult], b: Sequence[RunResult]) -> tuple[list[RunResult], list[RunResult]]:
+    """The runs of scenes and seeds that both have: one that failed is missing on both sides."""
+    common = {_what(run) for run in a} & {_what(run) for run in b}
+    return [run for run in a if _what(run) in common], [run for run in b if _what(run) in common]
+
+
+def _what(run: RunResult) -> tuple[str, int]:
+    return run.scene, run.identity["seed"]
+
+
+def _paired(a: Mapping[str, float], b: Mapping[str, float]) -> dict[str, float | int | str | None] | None:
+    """The first minus the second over the scenes of both; None without any. One scene has neither interval nor p."""
     common = sorted(set(a) & set(b))
-    if len(common) < 2:
+    if not common:
         return None
+    if len(common) == 1:
+        return {"mean": a[common[0]] - b[common[0]], "low": None, "high": None, "p": None, "smallest_p": None, "n": 1}
     test = paired_test({s: a[s] for s in common}, {s: b[s] for s in common})
     return {
         "mean": test.interval.value, "low": test.interval.low, "high": test.interval.high,
@@ -151,9 +207,11 @@ def _paired(a: Mapping[str, float], b: Mapping[str, float]) -> dict[str, float |
 def _difference(pair: dict[str, Any] | None, metric: Metric) -> str:
     if pair is None:
         return "—"
+    d = metric.decimals
+    if pair["n"] == 1:
+        return f"{pair['mean'] * metric.scale:+.{d}f}"
     mean, low, high = (pair[name] * metric.scale for name in ("mean", "low", "high"))
     mark = "*" if pair["p_adjusted"] < ALPHA else ""
-    d = metric.decimals
     return f"{mean:+.{d}f}{mark} [{low:+.{d}f}, {high:+.{d}f}]"
 
 
@@ -210,6 +268,10 @@ def _shown(interval: Interval | None, metric: Metric) -> str:
 
 def _whole(interval: Interval | None) -> str:
     return "—" if interval is None else f"{interval.value:.0f}"
+
+
+def _plain_text(value: Any) -> str:
+    return "+".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
 
 
 def _plain(value: Any) -> Any:

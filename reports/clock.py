@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from ihbench.machine import BUSY
 from ihbench.reports.document import Words
@@ -36,9 +37,12 @@ def machine_letters(runs: Sequence[RunResult]) -> dict[str, str]:
 
 
 def machine_name(run: RunResult) -> str:
-    """Processor, cores and device of a run, in words."""
+    """Processor, cores, threads and device of a run, in words: what must be equal for seconds to be compared."""
     about = run.record.get("machine") or {}
-    words = [str(about.get("cpu") or "unknown processor"), f"{about.get('cores_usable') or '?'} cores"]
+    cores, threads = about.get("cores_usable"), about.get("torch_threads")
+    words = [str(about.get("cpu") or "unknown processor"), _counted(cores, "core")]
+    if threads is not None:
+        words.append(_counted(threads, "thread"))
     device = run.record["about"].get("device", "cpu")
     if about.get("gpu"):
         words.append(str(about["gpu"]))
@@ -47,13 +51,18 @@ def machine_name(run: RunResult) -> str:
     return ", ".join(words)
 
 
+def one_clock(runs: Sequence[RunResult]) -> bool:
+    """Whether seconds of these runs may be averaged."""
+    return len({machine_name(run) for run in runs}) <= 1
+
+
 def unstable(runs: Sequence[RunResult]) -> list[str]:
     """Why the seconds of these runs (one row of a table) are unstable; nothing when they are not known to be."""
     reasons = []
     apart = max((_spread(group) for group in _by_scene(runs).values()), default=0.0)
     if apart > UNSTABLE:
         reasons.append(f"repeats {apart:.0%} of their median apart")
-    loads = [load for load in (_load_per_core(run) for run in runs) if load is not None]
+    loads = [load for load in map(_load_per_core, runs) if load is not None]
     if loads and max(loads) > BUSY:
         busy = sum(load > BUSY for load in loads)
         reasons.append(f"{busy} of {len(runs)} runs on a busy machine (load up to {max(loads):.1f} per core)")
@@ -97,5 +106,12 @@ def _load(run: RunResult) -> float | None:
 
 
 def _load_per_core(run: RunResult) -> float | None:
-    load, cores = _load(run), (run.record.get("machine") or {}).get("cores_usable")
-    return None if load is None or not cores else load / cores
+    """The larger of the loads at the start, which the run has no part in, and at its end, where a run on all cores
+    alone brings about 1 per core. Load is the whole machine's, and so are the cores it is divided by."""
+    about = run.record.get("machine") or {}
+    loads = [float(about[name][0]) for name in ("load_average", "load_average_end") if about.get(name)]
+    return max(loads) / about["cores"] if loads and about.get("cores") else None
+
+
+def _counted(number: Any, what: str) -> str:
+    return f"{number if number is not None else '?'} {what}{'' if number == 1 else 's'}"

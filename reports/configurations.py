@@ -20,7 +20,7 @@ class Configuration:
     label: str
     method: str
     changed: Mapping[str, str]  # switch -> value as text, of those that differ from the profile
-    settings: Mapping[str, Any]  # every switch -> value, names dotted
+    settings: Mapping[str, Any]  # every switch -> value that was in force, names dotted; None where runs differ
     runs: tuple[RunResult, ...]
 
 
@@ -50,7 +50,7 @@ def configurations(runs: Sequence[RunResult], across: bool = False) -> list[Conf
         for part in parts.values():
             first = part[0]
             changed = dict(text.partition("=")[::2] for text in first.record["about"]["changed"])
-            settings = _flat(first.identity.get("config") or {})
+            settings = _flat(first.identity.get("config") or {}) | _in_force(part)
             name = label
             if across:
                 size = _image_size(first)
@@ -111,6 +111,13 @@ def _flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         else:
             out[prefix + name] = value
     return out
+
+
+def _in_force(runs: Sequence[RunResult]) -> dict[str, Any]:
+    """Switches that the plan has changed -> value; None where not all runs have the same."""
+    first, *others = [run.planned for run in runs]
+    names = dict.fromkeys(name for changed in (first, *others) for name in changed)
+    return {n: first.get(n) if all(o.get(n) == first.get(n) for o in others) else None for n in names}
 
 
 def _version(run: RunResult) -> str:

@@ -10,6 +10,7 @@ from ihbench.calibration import DESCRIPTIONS, ROWS
 from ihbench.metrics import Identity, Mean, macro_mean
 from ihbench.metrics.identity import metric_of
 from ihbench.quality_time import Target
+from ihbench.reports.clock import one_clock
 from ihbench.reports.document import (
     Block,
     Bullets,
@@ -169,7 +170,10 @@ def _table(
         ]
         cells += [_cell([(runs[k].scene, rows_of[k][runs[k].method]) for k in chosen], i) for i in columns]
         if with_costs:
-            cells += [_mean_of(group, "fit_seconds"), _mean_of(group, "total_seconds"), _largest(group, "peak_mb")]
+            seconds = [
+                _mean_of(group, name) if one_clock(group) else "—" for name in ("fit_seconds", "total_seconds")
+            ]
+            cells += [*seconds, _largest(group, "peak_mb")]
         lines.append(tuple(cells))
         method = group[0].method
         further = [row for k in chosen for row in rows_of[k] if row.startswith(f"{method} [")]
@@ -217,6 +221,7 @@ def _remarks(runs: list[RunResult]) -> list[str]:
     absent: dict[tuple[str, str], list[str]] = {}
     partly: dict[tuple[str, str, str], list[str]] = {}
     notes: list[str] = []
+    labels = {id(run): label for label, group in by_label(runs).items() for run in group}
     for run in runs:
         for identity, mean in run.rows[run.method].items():
             metric, region = metric_of(identity).title, Identity.parse(identity).region
@@ -224,7 +229,10 @@ def _remarks(runs: list[RunResult]) -> list[str]:
                 absent.setdefault((metric, mean.reason), []).append(region)
             elif mean.note:
                 partly.setdefault((run.scene, region, mean.note), []).append(metric)
-        notes += [f"left out: {o['field']} → {o['value']}: {o['reason']}" for o in run.record["about"]["left_out"]]
+        notes += [
+            f"left out, {labels[id(run)]} on {run.scene}: {o['field']} → {o['value']}: {o['reason']}"
+            for o in run.record["about"]["left_out"]
+        ]
         notes += [
             f"{run.method} on {run.scene}: {note}"
             for note in run.record["about"].get("predictions", {}).get("notes", ())

@@ -20,11 +20,11 @@ from ihbench.reports.configurations import Configuration, configurations, short_
 from ihbench.reports.run_time import (
     LEVEL,
     WorkPoint,
+    comparable,
     curve_identities,
     curves,
     same_protocol,
     seconds_interval,
-    shared_scenes,
     work_points,
 )
 from ihbench.results import RunResult
@@ -87,7 +87,7 @@ def _new(name: str, digest: str, taken: set[str]) -> str:
 def _work_precision(
     configs: Sequence[Configuration], headline: str, path: Path, title: str, about: str
 ) -> list[tuple[Path, str]]:
-    scenes = shared_scenes(configs)
+    configs, scenes = comparable(configs)
     found: dict[str, list[WorkPoint]] = {}
     for i in dict.fromkeys(i for c in configs for run in c.runs for i in run.rows[run.method]):
         parsed = Identity.parse(i)

@@ -83,6 +83,7 @@ class Component:
     name: str
     on: tuple[str, ...] = ()  # switches that must all be on
     several: str = ""  # switch that must hold more than one value
+    equal: tuple[tuple[str, str], ...] = ()  # switches that must have one value, and that value
     measured_only: bool = False
 
 
@@ -167,7 +168,13 @@ def _table(name: str, raw: dict[str, Any], source: str, digits: dict[str, dict[s
         groups=groups,
         rows=tuple(_row(row) for row in raw["row"]),
         components=tuple(
-            Component(c["name"], tuple(c.get("on", ())), c.get("several", ""), c.get("measured_only", False))
+            Component(
+                c["name"],
+                on=tuple(c.get("on", ())),
+                several=c.get("several", ""),
+                equal=tuple(c.get("equal", {}).items()),
+                measured_only=c.get("measured_only", False),
+            )
             for c in raw.get("component", ())
         ),
         notes=tuple(raw.get("notes", ())),

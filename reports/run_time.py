@@ -46,10 +46,20 @@ class WorkPoint:
 # ----------------------------------------------------------------------------------------------------------- numbers
 
 
-def shared_scenes(configs: Sequence[Configuration]) -> list[str]:
-    """Scenes that every configuration was run on: only over these can they be compared."""
-    common = set.intersection(*({run.scene for run in c.runs} for c in configs)) if configs else set()
-    return sorted(common)
+def comparable(configs: Sequence[Configuration]) -> tuple[list[Configuration], list[str]]:
+    """Configurations that can be compared, and the scenes that all of these were run on.
+
+    Where no scene is common to all, or few are, those rows stand back that lack what most others have: chosen are the
+    scenes of one row, or what two have in common, with the most rows times scenes.
+    """
+    own = [frozenset(run.scene for run in c.runs) for c in configs]
+    choices = dict.fromkeys(a & b for a in own for b in own if a & b)
+    best: tuple[list[Configuration], frozenset[str]] = ([], frozenset())
+    for scenes in choices:
+        members = [c for c, having in zip(configs, own, strict=True) if scenes <= having]
+        if (len(members) * len(scenes), len(members)) > (len(best[0]) * len(best[1]), len(best[0])):
+            best = members, scenes
+    return best[0], sorted(best[1])
 
 
 def work_points(configs: Sequence[Configuration], identity: str, scenes: Sequence[str]) -> list[WorkPoint]:
@@ -126,7 +136,7 @@ def across_sizes_section(results: Sequence[RunResult]) -> list[Block]:
         headline = runs[0].record["about"]["headline"]
         identities = list(dict.fromkeys(i for run in runs for i in run.rows[run.method]))
         configs = configurations(runs, across=True)
-        if shared_scenes(configs):
+        if len(comparable(configs)[0]) > 1:
             table = _cost_table(configs, identities, headline)
             warning = (
                 "Profiles and image sizes are scored on test images of different size, maybe of different views: "
@@ -152,9 +162,7 @@ def same_protocol(results: Sequence[RunResult]) -> dict[tuple[str, str], list[Ru
 
 def _cost_table(configs: Sequence[Configuration], identities: Sequence[str], headline: str) -> list[Block]:
     columns = [i for i in identities if Identity.parse(i).region == headline]
-    scenes = shared_scenes(configs)
-    if not scenes:
-        return [Paragraph("These rows have no scene in common: their seconds and errors cannot be compared.")]
+    all_rows, (configs, scenes) = configs, comparable(configs)
     points = {i: {p.configuration.label: p for p in work_points(configs, i, scenes)} for i in columns}
     columns = [i for i in columns if points[i]]
     best: dict[str, list[str]] = {}
@@ -186,10 +194,12 @@ def _cost_table(configs: Sequence[Configuration], identities: Sequence[str], hea
     head = ["method", "runs", f"fit s [{SPREAD}]" if kinds else "fit s", "total s", "peak MB"]
     head += ["GPU MB"] if on_gpu else []
     told = (
-        f"Region {headline}, {len(scenes)} scene{'s' if len(scenes) > 1 else ''} that all rows have. The fit clock "
-        "stands still while checkpoints are scored and states are saved; total s is the whole run. Pareto: by these "
-        "means no other row is as fast and better in this metric."
+        f"Region {headline}, {len(scenes)} scene{'s' if len(scenes) > 1 else ''} that all these rows have. The fit "
+        "clock stands still while checkpoints are scored and states are saved; total s is the whole run. Pareto: by "
+        "these means no other row is as fast and better in this metric."
     )
+    lacking = [c.label for c in all_rows if c not in configs]
+    told += f" Not here, because they lack some of these scenes: {'; '.join(lacking)}." if lacking else ""
     told += f" Intervals: {'; '.join(kinds)}." if kinds else ""
     return [Table((*head, *metrics, "Pareto"), tuple(rows)), Paragraph(told)]
 
@@ -206,7 +216,7 @@ def _quality_times(configs: Sequence[Configuration], headline: str, targets: Seq
 def _time_table(
     configs: Sequence[Configuration], known: Sequence[str], headline: str, targets: Sequence[Target]
 ) -> list[Block]:
-    scenes = shared_scenes(configs)
+    configs, scenes = comparable(configs)
     if not targets:
         targets = _chosen_targets(configs, known, headline)
     columns: list[tuple[Target, str]] = []
@@ -277,7 +287,7 @@ def _time_cell(
 
 
 def _area_table(configs: Sequence[Configuration], known: Sequence[str]) -> list[Block]:
-    scenes = shared_scenes(configs)
+    configs, scenes = comparable(configs)
     columns: list[tuple[str, float, float]] = []
     for metric in ON_THE_CURVE:
         for i in known:

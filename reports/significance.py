@@ -92,19 +92,22 @@ def _comparisons(values: Mapping[str, Mapping[str, float]], metric: Metric) -> l
     unit = f" {metric.unit}" if metric.unit == "dB" else ""
     lines = []
     for label, (test, differences) in tests.items():
-        smallest = smallest_detectable_difference(differences, ALPHA, POWER) * metric.scale
+        smallest = smallest_detectable_difference(differences, ALPHA / len(tests), POWER) * metric.scale
         spread = ""
         if math.isfinite(test.interval.low):
             low, high = (value * metric.scale for value in (test.interval.low, test.interval.high))
             spread = f" [{low:+.{metric.decimals}f}, {high:+.{metric.decimals}f}]"
         verdict = "significant" if adjusted[label] < ALPHA else "not significant"
-        if test.smallest_p >= ALPHA:
-            verdict = f"cannot be significant: {len(differences)} scenes allow no p below {test.smallest_p:.2g}"
+        verdict += f"; a true difference of {smallest:.{metric.decimals}f}{unit} would be found {POWER:.0%} of the time (t test)"
+        least = test.smallest_p * len(tests)
+        if least >= ALPHA:
+            verdict = (
+                f"cannot be significant: {len(differences)} scenes allow no adjusted p below {min(least, 1):.2g}"
+            )
         lines.append(
             f"{metric.title}: {best} against {label}: "
             f"{test.interval.value * metric.scale:+.{metric.decimals}f}{spread}{unit}, "
             f"p = {adjusted[label]:.2g} (sign-flip test over {len(differences)} scenes, Holm over {len(tests)}), "
-            f"{verdict}; a true difference of {smallest:.{metric.decimals}f}{unit} would be found "
-            f"{POWER:.0%} of the time"
+            f"{verdict}"
         )
     return lines

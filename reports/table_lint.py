@@ -242,8 +242,15 @@ def _marks_of(column: _Column, entries: Sequence[_Entry], used: set[str], paired
     if column.metric.cost:  # often shown beside the quality and not ranked
         used = {entry.cell.mark for entry in column.entries}
     yield from _one_mark(column, entries, found, "best", best, "best" in used, paired)
+    tied = [e for e in entries if not _among(e, best) and _within_noise(best[0].number, e.number, higher)]
+    sharing = [e for e in tied if e.cell.mark == "best"] if all(e.cell.mark == "best" for e in best) else []
+    if sharing:  # the next one that is not called best may be called second
+        rest = [(e, rank) for e, rank in zip(entries, found, strict=True) if not _among(e, [*best, *sharing])]
+        next_best = [e for e, rank in rest if rank == min(rank for _, rank in rest)]
+        if not next_best:
+            return
     # two best leave no second, and of two numbers the second is the last; who marks it all the same does no harm
-    strict = len(best) == 1 and len(entries) > 2
+    strict = len(best) == 1 and len(entries) > 2 and not tied
     yield from _one_mark(column, entries, found, "second", next_best, strict and "second" in used, paired)
 
 

@@ -11,6 +11,7 @@ import tyro
 
 from ihbench import registry
 from ihbench.commands.device import check_device
+from ihbench.commands.keep import check_keep
 from ihbench.commands.parse import options
 from ihbench.commands.scene_choice import SceneChoice
 from ihbench.errors import BadInput
@@ -30,6 +31,9 @@ class AblateOptions(SceneChoice):
     """A grid instead of a ladder: NAME=VALUE:VALUE:..., such as levels=64:64,128 inpaint.on=on:off."""
     set: tuple[str, ...] = ()
     """Switches for every rung, NAME=VALUE, such as steps=200."""
+    keep: tuple[str, ...] = ()
+    """Fields that the plan must not change (`ihbench plan` lists them), or all. Fields that the rungs set are kept
+    anyway: what is compared is what was asked for."""
     seed: tuple[int, ...] = (0, 1, 2)
     """Seeds; their scores are averaged per scene before anything is compared."""
     device: Literal["cpu", "cuda"] = "cpu"
@@ -140,31 +144,38 @@ def _value(chosen: AblateOptions, config: Any, name: str, text: str) -> Any:
 
 def _cells(chosen: AblateOptions, ladder: Ladder, progress: Any) -> list[tuple[str, Cell]]:
     """Rung and cell of every run: seeds outermost, so that an early table holds every rung."""
-    from ihbench.ablation import configured, shared_part
+    from ihbench.ablation import configured, kept, shared_part
     from ihbench.cells import Cell
     from ihbench.data_source import locate
     from ihbench.protocol import load_protocol
     from ihbench.run_loop import RunRequest, configuration
 
     config = configuration(chosen.method, chosen.profile, {})
+    if chosen.keep and "all" not in chosen.keep:
+        check_keep(chosen.keep, config)
     shared = getattr(registry.load("config", chosen.method), "SHARED_STATES", {}) if chosen.share else {}
     cells: list[tuple[str, Cell]] = []
     for protocol in chosen.apply(load_protocol(chosen.protocol, chosen.profile)):
         source = locate(protocol, chosen.data, chosen.scene)
         for scene in source.scenes:
-            source.open(scene, chosen.body, progress)  # makes a stand-in once, before many want it
+            try:
+                source.open(scene, chosen.body, progress)  # makes a stand-in once, before many want it
+            except BadInput as error:  # its cells will say so again; the other scenes go on
+                progress.say(f"{scene}: {error}")
         for seed in dict.fromkeys(chosen.seed):
             for scene in source.scenes:
                 first: dict[Any, int] = {}
                 for rung in ladder.rungs:
                     own = configured(rung, config)
+                    keep = tuple(dict.fromkeys((*chosen.keep, *kept(ladder, rung, config))))
                     request = RunRequest(
                         protocol, chosen.method, own, seed, chosen.device, chosen.runs, chosen.body,
-                        keep=rung.keep, share=bool(shared),
+                        keep=keep, share=bool(shared),
                     )  # fmt: skip
                     after = None
                     for free in shared.values():
-                        after = first.setdefault((shared_part(own, free), rung.keep), len(cells))
+                        pinned = tuple(name for name in keep if not name.startswith(tuple(free)))
+                        after = first.setdefault((shared_part(own, free), pinned), len(cells))
                     name = f"{protocol.name} {scene} seed {seed}, {rung.name}"
                     waits = after if after != len(cells) else None
                     cells.append((rung.name, Cell(name, request, source, scene, waits)))

@@ -31,20 +31,23 @@ def main(argv: list[str]) -> int:
 
 def _planned(chosen: SceneChoice, protocol: Protocol) -> dict[str, Any]:
     from ihbench.data_source import locate, open_capture
-    from ihbench.plan import absent_regions, expected_seconds, measure_scene, stage_seconds
+    from ihbench.earlier_runs import earlier_runs
+    from ihbench.machine import cpu_model
+    from ihbench.plan import absent_regions, measure_scene
     from ihbench.run_loop import configuration
 
     config = configuration(chosen.method, chosen.profile, {})
     leave_out = registry.load("config", chosen.method).leave_out
     source = locate(protocol, chosen.data, chosen.scene)
-    expected = expected_seconds(chosen.runs, chosen.method, chosen.profile)
-    stages = stage_seconds(chosen.runs, chosen.method, chosen.profile)
+    earlier = earlier_runs(chosen.runs, chosen.method, protocol.name, chosen.profile, cpu_model())
     report = {
         "protocol": protocol.name,
         "profile": chosen.profile,
         "method": chosen.method,
         "data": "stand-in" if source.is_standin else str(source.root),
-        "expected_seconds_per_scene": expected,
+        "expected_seconds_per_scene": None if earlier is None else earlier.seconds,
+        "earlier_runs": 0 if earlier is None else earlier.count,
+        "earlier_runs_had_other_switches": earlier is not None and not earlier.same_switches,
         "config": asdict(config),
         "scenes": {},
     }
@@ -63,7 +66,9 @@ def _planned(chosen: SceneChoice, protocol: Protocol) -> dict[str, Any]:
         omissions = leave_out(config, measure) + absent_regions(measure, protocol.regions)
         report["scenes"][scene] = {
             "measure": asdict(measure),
-            "left_out": [asdict(o) | {"seconds": o.seconds(stages)} for o in omissions],
+            "left_out": [
+                asdict(o) | {"seconds": o.seconds({} if earlier is None else earlier.stages)} for o in omissions
+            ],
         }
     return report
 
@@ -71,11 +76,12 @@ def _planned(chosen: SceneChoice, protocol: Protocol) -> dict[str, Any]:
 def _print(report: dict) -> None:
     print(f"{report['method']} under {report['protocol']}, {report['profile']} profile, on {report['data']}")
     seconds = report["expected_seconds_per_scene"]
-    print(
-        f"expected: {seconds:.0f} s per scene, from earlier runs"
-        if seconds
-        else "expected: unknown, no earlier run to go by"
-    )
+    if seconds:
+        which = f"{report['earlier_runs']} earlier run{'s' * (report['earlier_runs'] > 1)} of this protocol"
+        others = " with other switches" if report["earlier_runs_had_other_switches"] else ""
+        print(f"expected: {seconds:.0f} s per scene, the median of {which} on such a processor{others}")
+    else:
+        print("expected: unknown, no earlier run of this protocol on such a processor to go by")
     for scene, found in report["scenes"].items():
         print(f"\n{scene}")
         if "note" in found:

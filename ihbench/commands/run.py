@@ -10,6 +10,7 @@ import tyro
 
 from ihbench import registry
 from ihbench.commands.device import check_device
+from ihbench.commands.keep import check_keep
 from ihbench.commands.parse import options
 from ihbench.commands.scene_choice import SceneChoice
 from ihbench.errors import BadInput
@@ -68,7 +69,7 @@ def _run(chosen: Any) -> int:
 
     protocols = chosen.apply(load_protocol(chosen.protocol, chosen.profile))
     if chosen.keep and "all" not in chosen.keep:
-        _check_keep(chosen.keep, chosen.config)
+        check_keep(chosen.keep, chosen.config)
     if not chosen.seed or min(chosen.seed) < 0:
         raise BadInput(f"--seed {' '.join(map(str, chosen.seed))}: expected one number or more, each 0 or above")
     progress = Progress()
@@ -93,12 +94,3 @@ def _run(chosen: Any) -> int:
                 f"{result.scene}: {result.folder / 'contact_sheet.png' if result.status == 'done' else result.folder}"
             )
     return 0 if all(result.status == "done" for result in results) else 1
-
-
-def _check_keep(keep: tuple[str, ...], config: Any) -> None:
-    from ihbench.config_fields import flat
-
-    known = list(flat(config))
-    for name in keep:
-        if name not in known:
-            raise BadInput(f"--keep {name}: no such switch: {registry.nearest(name, known)}")

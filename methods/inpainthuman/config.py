@@ -14,6 +14,7 @@ from ihbench.errors import BadInput
 from ihbench.methods.inpainthuman.inpainting.inpaint_config import PAPER_INPAINT, QUICK_INPAINT, InpaintConfig
 from ihbench.methods.inpainthuman.refine_config import PAPER_REFINE, QUICK_REFINE, RefineConfig
 from ihbench.plan import Omission, SceneMeasure
+from ihbench.weights import FILES, locate
 
 STATIC_DEG = 5.0  # below this joint motion nothing depends on the pose
 NOTHING_HIDDEN = 0.002  # share of the texels that no frame shows although one faces them; fewer are specks
@@ -183,11 +184,27 @@ def config_from(words: dict[str, Any]) -> InpaintHumanConfig:
 
 
 def outside_files(config: InpaintHumanConfig) -> list[Path]:
-    """Folders whose content affects the answer."""
-    inpaint = config.inpaint
+    """Files and folders whose content affects the answer: weights that the configuration names, and the trunk of
+    LPIPS, whose term is off while the file is not there."""
+    inpaint, refine = config.inpaint, config.refine
     if not inpaint.on:
         return []
-    named = [inpaint.weights, inpaint.control_weights] if inpaint.uses_diffusion else []
+    found = []
+    if inpaint.uses_diffusion:
+        found += [_folder(name) for name in (inpaint.weights, inpaint.control_weights) if name]
     if inpaint.silhouette == "sam":
-        named.append(inpaint.sam_weights)
-    return [Path(name).expanduser() for name in named if name and Path(name).expanduser().is_dir()]
+        found.append(_folder(inpaint.sam_weights))
+    if refine.steps > 0 and refine.weight > 0 and refine.lpips > 0:
+        trunk = locate(FILES[f"lpips-{refine.lpips_net}"])
+        found.append(trunk if isinstance(trunk, Path) else None)
+    return [path for path in found if path is not None]
+
+
+def _folder(name: str) -> Path | None:
+    """A folder, or the cached snapshot of a hub id; None for what the run will complain of by itself."""
+    from ihbench.methods.inpainthuman.inpainting.checkpoint import find_folder
+
+    try:
+        return find_folder(name, "")
+    except BadInput:
+        return None

@@ -10,15 +10,14 @@ from scipy.spatial.transform import Rotation
 from ihbench import plan
 from ihbench.body import texel_table
 from ihbench.config_fields import flat, with_fields
+from ihbench.earlier_runs import earlier_runs
 from ihbench.methods.inpainthuman.config import LEAST_TEXELS, PAPER, QUICK, RESIDUAL_SHARE, leave_out
 from ihbench.plan import (
     TEXELS,
     Omission,
     SceneMeasure,
     absent_regions,
-    expected_seconds,
     measure_scene,
-    stage_seconds,
 )
 from ihbench.protocol import REGIONS
 from ihbench.scene import BodyPose
@@ -228,37 +227,51 @@ def test_only_some_of_many_views_are_read(monkeypatch):
 # ---------------------------------------------------------------------------------------------- expected time
 
 
-def a_run(seconds, method="inpainthuman", profile="quick", status="done"):
+def a_run(seconds, method="inpainthuman", profile="quick", status="done", protocol="p@1", cpu="one", **about):
     return {
         "status": status,
-        "identity": {"method": method, "profile": profile},
-        "about": {"total_seconds": seconds},
+        "identity": {"method": method, "profile": profile, "protocol": protocol},
+        "about": {"total_seconds": seconds, "changed": [], "left_out": [], **about},
+        "machine": {"cpu": cpu},
         "ledger": {"stages": {"fit/stage1": {"seconds": 0.5 * seconds}}} if isinstance(seconds, int) else {},
     }
 
 
+def runs_of(folder, records):
+    for k, record in enumerate(records):
+        (folder / str(k)).mkdir()
+        (folder / str(k) / "run.json").write_text(json.dumps(record))
+    return folder
+
+
 def test_expected_seconds_are_the_median_of_finished_runs_alike(tmp_path):
-    assert expected_seconds(tmp_path / "nowhere", "inpainthuman", "quick") is None
+    def seconds(method="inpainthuman", protocol="p@1", profile="quick", cpu="one"):
+        found = earlier_runs(tmp_path, method, protocol, profile, cpu)
+        return None if found is None else (found.seconds, found.count, found.same_switches)
+
+    assert seconds() is None
     records = [a_run(10), a_run(30), a_run(100), a_run(999, status="failed"), a_run(5, profile="paper")]
     records += [a_run(1, method="other"), {"status": "done"}, [], a_run("soon"), a_run(None)]
-    for k, record in enumerate(records):
-        (tmp_path / str(k)).mkdir()
-        (tmp_path / str(k) / "run.json").write_text(json.dumps(record))
+    records += [a_run(2, protocol="p@1+size=64"), a_run(3, cpu="two"), a_run(4, changed=["steps=60"])]
+    records += [a_run(7, cpu="three", changed=["steps=60"])]
+    runs_of(tmp_path, records)
     (tmp_path / "cut").mkdir()
     (tmp_path / "cut" / "run.json").write_text('{"status": "do')
-    assert expected_seconds(tmp_path, "inpainthuman", "quick") == 30
-    assert expected_seconds(tmp_path, "inpainthuman", "paper") == 5
-    assert expected_seconds(tmp_path, "another", "quick") is None
+    assert seconds() == (30, 3, True)
+    assert seconds(profile="paper") == (5, 1, True)
+    assert seconds(protocol="p@1+size=64") == (2, 1, True)
+    assert seconds(cpu="two") == (3, 1, True)
+    assert seconds(cpu="three") == (7, 1, False)
+    assert seconds(method="another") is None
 
 
 def test_what_an_omission_saves_is_its_share_of_the_stages_of_earlier_runs(tmp_path, moving):
-    for k, seconds in enumerate((10, 30, 100)):
-        (tmp_path / str(k)).mkdir()
-        record = a_run(seconds)
-        if k == 2:
-            record["ledger"]["stages"] |= {"fit/stage2": {"seconds": 40}, "fit/stage3": {"seconds": 20}}
-        (tmp_path / str(k) / "run.json").write_text(json.dumps(record))
-    stages = stage_seconds(tmp_path, "inpainthuman", "quick")
+    records = [a_run(10), a_run(30), a_run(100)]
+    records[2]["ledger"]["stages"] |= {"fit/stage2": {"seconds": 40}, "fit/stage3": {"seconds": 20}}
+    records.append(a_run(2, left_out=[{"field": "texels", "value": 64, "reason": ""}]))  # did less
+    records[0]["about"]["left_out"] = [{"field": "never_seen", "value": None, "reason": ""}]  # a region, no work
+    earlier = earlier_runs(runs_of(tmp_path, records), "inpainthuman", "p@1", "quick", "one")
+    stages = earlier.stages
     assert stages == {"fit/stage1": 15, "fit/stage2": 40, "fit/stage3": 20}
     found = {o.field: o.seconds(stages) for o in leave_out(QUICK, replace(moving, motion_deg=0.0, hidden_texels=0.0))}
     assert found["inpaint.on"] == 60

@@ -232,3 +232,28 @@ def test_weights_outside_the_package_are_part_of_a_runs_identity(mini):
     assert outside_files(config(mini)) == [mini]
     assert outside_files(config(mini, filler="mean")) == []
     assert outside_files(QUICK) == []
+
+
+def test_lpips_weights_that_come_later_make_another_run(mini, tmp_path, monkeypatch):
+    from ihbench import weights
+
+    given = config(mini)
+    given = replace(given, refine=replace(given.refine, lpips=0.1))
+    request = RunRequest(load_protocol("zju_occ"), "inpainthuman", given)
+    monkeypatch.setattr(weights, "folders", lambda: [tmp_path])
+    before = _outside(request)
+    trunk = weights.FILES["lpips-vgg"]
+    (tmp_path / trunk.file).write_bytes(b"a trunk")
+    monkeypatch.setattr(weights, "is_right", lambda *_: True)
+    assert outside_files(given) == [mini, tmp_path / trunk.file]
+    assert _outside(request)["outside"] != before["outside"]
+    assert outside_files(replace(given, refine=replace(given.refine, lpips=0.0))) == [mini]
+
+
+def test_a_hub_id_is_the_snapshot_it_stands_for(tmp_path, monkeypatch):
+    from ihbench.methods.inpainthuman.inpainting import checkpoint
+
+    given = replace(QUICK, inpaint=replace(QUICK.inpaint, backbone="sd2", weights="someone/sd2-inpainting"))
+    assert outside_files(given) == []  # not in the cache: the run says so
+    monkeypatch.setattr(checkpoint, "find_folder", lambda name, _: tmp_path)
+    assert outside_files(given) == [tmp_path]

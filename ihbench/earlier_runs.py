@@ -1,0 +1,65 @@
+"""What finished runs tell about how long the next one will take."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from ihbench.atomic import read_json
+from ihbench.errors import BadInput
+
+
+@dataclass(frozen=True)
+class EarlierRuns:
+    """Finished runs of one method under one protocol and profile on one processor."""
+
+    count: int
+    same_switches: bool  # whether they have the profile's
+    seconds: float  # median total
+    stages: Mapping[str, float]  # ledger path -> median seconds, over the runs that had the stage
+
+
+def earlier_runs(runs: Path, method: str, protocol: str, profile: str, cpu: str) -> EarlierRuns | None:
+    """Those under the folder `runs`; None without any. `protocol` is its name with version and changes. Runs with the
+    profile's own switches come first, and where some needed everything, the stages are theirs."""
+    found = list(_finished(runs, method, protocol, profile, cpu))
+    plain = [(about, ledger) for about, ledger in found if not about.get("changed")]
+    chosen = plain or found
+    if not chosen:
+        return None
+    whole = [(about, ledger) for about, ledger in chosen if not _planned_away(about)] or chosen
+    stages: dict[str, list[float]] = {}
+    for _, ledger in whole:
+        for path, stage in ledger["stages"].items():
+            stages.setdefault(path, []).append(float(stage["seconds"]))
+    seconds = median(float(about["total_seconds"]) for about, _ in chosen)
+    return EarlierRuns(len(chosen), bool(plain), seconds, {path: median(values) for path, values in stages.items()})
+
+
+def _planned_away(about: Mapping[str, Any]) -> bool:
+    return any(o["value"] is not None for o in about.get("left_out", ()))
+
+
+def _finished(
+    runs: Path, method: str, protocol: str, profile: str, cpu: str
+) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
+    """`about` and ledger. A damaged record tells nothing about time and is passed over."""
+    wanted = (method, protocol, profile, cpu)
+    for path in sorted(runs.glob("*/run.json")):
+        try:
+            record = read_json(path)
+            identity = record["identity"]
+            own = (identity["method"], identity["protocol"], identity["profile"], record["machine"]["cpu"])
+            if record["status"] != "done" or own != wanted:
+                continue
+            about, ledger = record["about"], record["ledger"]
+            float(about["total_seconds"])
+            _planned_away(about)
+            for stage in ledger["stages"].values():
+                float(stage["seconds"])
+        except (BadInput, AttributeError, KeyError, TypeError, ValueError):
+            continue
+        yield about, ledger
