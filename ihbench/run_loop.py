@@ -253,11 +253,8 @@ def _planned(request: RunRequest, measure: SceneMeasure) -> tuple[Any, list[Omis
         return request.config, left_out
     found = registry.load("config", request.method)
     own, base = flat(request.config), flat(found.PROFILES[request.protocol.profile])
-    proposed = [
-        o
-        for o in found.leave_out(request.config, measure)
-        if o.field not in request.keep and own[o.field] == base[o.field]
-    ]
+    free = [name for name in own if name not in request.keep and own[name] == base[name]]
+    proposed = [o for o in found.leave_out(request.config, measure) if o.field in free]
     return with_fields(request.config, {o.field: o.value for o in proposed}), proposed + left_out
 
 

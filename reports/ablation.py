@@ -93,13 +93,8 @@ def _table(ladder: Ladder, protocol: str, cells: Found) -> tuple[list[str], dict
 
 def _omissions(runs: Sequence[RunResult]) -> dict[str, int]:
     """What the plan left out -> in how many of the runs."""
-    count: dict[str, int] = {}
-    for run in runs:
-        for o in run.record["about"].get("left_out", ()):
-            if o["value"] is not None:
-                text = f"{o['field']} → {_plain_text(o['value'])}"
-                count[text] = count.get(text, 0) + 1
-    return count
+    told = [f"{field} → {_plain_text(value)}" for run in runs for field, value in run.planned.items()]
+    return {text: told.count(text) for text in dict.fromkeys(told)}
 
 
 def _left_out(runs: Mapping[str, Sequence[RunResult]]) -> list[str]:
@@ -114,10 +109,12 @@ def _left_out(runs: Mapping[str, Sequence[RunResult]]) -> list[str]:
 
 def _timed(runs: Mapping[str, Sequence[RunResult]]) -> dict[str, list[RunResult]]:
     """Rung -> its runs that have a clock."""
-    timed = {
-        rung: [r for r in having if r.record["about"].get("fit_seconds") is not None] for rung, having in runs.items()
-    }
-    return {rung: having for rung, having in timed.items() if having}
+    found = {}
+    for rung, having in runs.items():
+        timed = [run for run in having if run.record["about"].get("fit_seconds") is not None]
+        if timed:
+            found[rung] = timed
+    return found
 
 
 def _columns(runs: Sequence[RunResult], headline: str) -> list[str]:

@@ -170,10 +170,9 @@ def _table(
         ]
         cells += [_cell([(runs[k].scene, rows_of[k][runs[k].method]) for k in chosen], i) for i in columns]
         if with_costs:
-            seconds = [
-                _mean_of(group, name) if one_clock(group) else "—" for name in ("fit_seconds", "total_seconds")
-            ]
-            cells += [*seconds, _largest(group, "peak_mb")]
+            alike = one_clock(group)  # seconds of several machines have no mean
+            cells += [_mean_of(group, name) if alike else "—" for name in ("fit_seconds", "total_seconds")]
+            cells.append(_largest(group, "peak_mb"))
         lines.append(tuple(cells))
         method = group[0].method
         further = [row for k in chosen for row in rows_of[k] if row.startswith(f"{method} [")]
@@ -221,6 +220,7 @@ def _remarks(runs: list[RunResult]) -> list[str]:
     absent: dict[tuple[str, str], list[str]] = {}
     partly: dict[tuple[str, str, str], list[str]] = {}
     notes: list[str] = []
+    omitted: dict[tuple[str, str], list[str]] = {}  # row and what was left out -> scenes
     labels = {id(run): label for label, group in by_label(runs).items() for run in group}
     for run in runs:
         for identity, mean in run.rows[run.method].items():
@@ -229,14 +229,15 @@ def _remarks(runs: list[RunResult]) -> list[str]:
                 absent.setdefault((metric, mean.reason), []).append(region)
             elif mean.note:
                 partly.setdefault((run.scene, region, mean.note), []).append(metric)
-        notes += [
-            f"left out, {labels[id(run)]} on {run.scene}: {o['field']} → {o['value']}: {o['reason']}"
-            for o in run.record["about"]["left_out"]
-        ]
+        for o in run.record["about"]["left_out"]:
+            what = f"{o['field']} → {o['value']}: {o['reason']}"
+            omitted.setdefault((labels[id(run)], what), []).append(run.scene)
         notes += [
             f"{run.method} on {run.scene}: {note}"
             for note in run.record["about"].get("predictions", {}).get("notes", ())
         ]
+    for (label, what), scenes in omitted.items():
+        notes.append(f"left out, {label} on {', '.join(dict.fromkeys(scenes))}: {what}")
     for (scene, region, note), metrics in partly.items():
         notes.append(f"{region} of {scene} ({', '.join(dict.fromkeys(metrics))}): {note}")
     for (metric, reason), regions in absent.items():

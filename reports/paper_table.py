@@ -369,8 +369,7 @@ def _components(components: Sequence[Component], runs: Sequence[RunResult]) -> t
 
 def _in_force(run: RunResult) -> dict[str, Any]:
     """Flat name -> value of the switches, as the scene's plan left them."""
-    omitted = {o["field"]: o["value"] for o in run.record["about"].get("left_out", ())}
-    return dict(_flat(run.identity.get("config", {}))) | omitted
+    return dict(_flat(run.identity.get("config", {}))) | run.planned
 
 
 def _flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -382,11 +381,8 @@ def _flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
 
 
 def _one(component: Component, configs: Sequence[Mapping[str, Any]]) -> str:
-    wanted = (
-        *component.on,
-        *(name for name, _ in component.equal),
-        *([component.several] if component.several else []),
-    )
+    wanted = [*component.on, *(name for name, _ in component.equal)]
+    wanted += [component.several] if component.several else []
     if any(name not in config for config in configs for name in wanted):
         return UNKNOWN
     found = {

@@ -97,13 +97,16 @@ def _comparisons(values: Mapping[str, Mapping[str, float]], metric: Metric) -> l
         if math.isfinite(test.interval.low):
             low, high = (value * metric.scale for value in (test.interval.low, test.interval.high))
             spread = f" [{low:+.{metric.decimals}f}, {high:+.{metric.decimals}f}]"
-        verdict = "significant" if adjusted[label] < ALPHA else "not significant"
-        verdict += f"; a true difference of {smallest:.{metric.decimals}f}{unit} would be found {POWER:.0%} of the time (t test)"
-        least = test.smallest_p * len(tests)
+        least = test.smallest_p * len(tests)  # Holm multiplies the smallest by the number of tests
         if least >= ALPHA:
-            verdict = (
-                f"cannot be significant: {len(differences)} scenes allow no adjusted p below {min(least, 1):.2g}"
+            n = len(differences)
+            verdict = f"cannot be significant: {n} scenes allow no adjusted p below {min(least, 1):.2g}"
+        else:
+            verdict = "significant" if adjusted[label] < ALPHA else "not significant"
+            verdict += (
+                f"; a true difference of {smallest:.{metric.decimals}f}{unit} would be found {POWER:.0%} of the "
             )
+            verdict += "time (t test)"
         lines.append(
             f"{metric.title}: {best} against {label}: "
             f"{test.interval.value * metric.scale:+.{metric.decimals}f}{spread}{unit}, "

@@ -63,12 +63,11 @@ def _planned(chosen: SceneChoice, protocol: Protocol) -> dict[str, Any]:
                 raise
             report["scenes"][scene] = {"note": f"the run makes the rest of this stand-in; measured then: {error}"}
             continue
+        stages = {} if earlier is None else earlier.stages
         omissions = leave_out(config, measure) + absent_regions(measure, protocol.regions)
         report["scenes"][scene] = {
             "measure": asdict(measure),
-            "left_out": [
-                asdict(o) | {"seconds": o.seconds({} if earlier is None else earlier.stages)} for o in omissions
-            ],
+            "left_out": [asdict(o) | {"seconds": o.seconds(stages)} for o in omissions],
         }
     return report
 

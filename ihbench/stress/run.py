@@ -52,8 +52,8 @@ def run_cases(cases: Sequence[Case], after_each: Callable[[Outcome], None] = lam
 
 
 def run_case(case: Case) -> Outcome:
-    """Run one case. An exception or a numerical warning in it is a failure, not the end. What is known excuses a wrong
-    answer and a numerical warning, never a crash."""
+    """Run one case. An exception or a numerical warning in it is a failure, not the end. What is known excuses a
+    wrong answer and a numerical warning, never a crash."""
     start = time.perf_counter()
     value, expected, error, condition, note, known = math.nan, math.nan, math.inf, None, "", case.known
     try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,22 +13,31 @@ import pytest
 
 from ihbench import cells as cells_module
 from ihbench import registry
-from ihbench.ablation import Comparison, Ladder, Rung, configured, grid, set_on_all, shared_part
+from ihbench.ablation import Comparison, Ladder, Rung, configured, grid, kept, set_on_all, shared_part
 from ihbench.atomic import read_json
 from ihbench.cells import Cell, run_cells
 from ihbench.commands import ablate as ablate_command
 from ihbench.commands.ablate import AblateOptions
 from ihbench.config_fields import flat
+from ihbench.data_source import DataSource
 from ihbench.errors import BadInput
 from ihbench.ledger import Ledger
-from ihbench.methods.inpainthuman.config import PROFILES, QUICK
+from ihbench.methods.inpainthuman.config import LEAST_TEXELS, PROFILES, QUICK
+from ihbench.plan import SceneMeasure
 from ihbench.progress import Progress
+from ihbench.protocol import load_protocol
 from ihbench.results import read_result
-from ihbench.shared_states import lend
+from ihbench.run_loop import RunRequest, _planned
+from ihbench.shared_states import lend, lender
 from ihbench.store import RunFolder
 from tests.conftest import SCENES
 
 TINY = ["texels=32", "levels=16", "decoder_width=32", "position_map=16"]
+
+
+@pytest.fixture
+def moving():
+    return SceneMeasure(1, 0, 1, 0, 1, 0.1, 0, motion_deg=50, turn_deg=0, pixel_mm=3, surface_mm=1500, occlusion={})
 
 
 def ablate(bench, *words, on=("inpaint.on=off",)):
@@ -49,6 +59,40 @@ def test_a_grid_is_every_combination_and_compares_with_the_first():
     assert len(ladder.comparisons) == 3
     with pytest.raises(BadInput, match="no such switch"):
         grid(QUICK, {"level": [1]})
+
+
+def test_a_grid_names_every_combination_apart():
+    assert [rung.name for rung in grid(QUICK, {"steps": [100, 100, 200]}).rungs] == ["steps=100", "steps=200"]
+    many = {"inpaint.sampler_steps": [6, 12], "inpaint.key_views": [20], "refine.warm_up": [0.1, 0.2]}
+    names = [rung.name for rung in grid(QUICK, many).rungs]
+    assert len(set(names)) == 4
+    assert names[0] == "inpaint.sampler_steps=6, refine.warm_up=0.1"  # what does not vary is no name
+    long = {f"inpaint.{name}": [3e-4, 1.23456789e-4] for name in ("ti_lr", "lora_lr", "control_lr")}
+    names = [rung.name for rung in grid(QUICK, long).rungs]
+    assert len(set(names)) == 8
+    assert max(map(len, names)) < 70
+
+
+def test_what_is_compared_is_kept_from_the_plan():
+    """A rung has what it says, also where it says what the profile has anyway."""
+    ladder = grid(QUICK, {"texels": [QUICK.texels, 2 * QUICK.texels], "inpaint.on": [True]})
+    assert [kept(ladder, rung, QUICK) for rung in ladder.rungs] == [("inpaint.on", "texels"), ("inpaint.on",)]
+    ladder = registry.load("ladder", "inpainthuman")["table2"]
+    full = ladder.rungs[-1]
+    assert set(kept(ladder, full, QUICK)) == {"levels", "inpaint.on", "inpaint.ti", "inpaint.sg"}
+    plan = registry.load("ladder", "inpainthuman")["plan"]
+    assert [kept(plan, rung, QUICK) for rung in plan.rungs] == [("all",), ()]
+
+
+@pytest.mark.parametrize(("keep", "texels"), [((), 32), (("texels",), QUICK.texels)])
+def test_the_plan_changes_only_what_nobody_has_set(moving, keep, texels):
+    far = replace(moving, pixel_mm=1000.0)
+    own = replace(QUICK, levels=(128, 256))
+    request = RunRequest(load_protocol("zju_occ"), "inpainthuman", own, keep=keep)
+    config, left_out = _planned(request, far)
+    assert config.levels == (128, 256)
+    assert config.texels == (LEAST_TEXELS if texels == 32 else texels)
+    assert "levels" not in [o.field for o in left_out]
 
 
 def test_a_ladder_compares_its_own_rungs_only():
@@ -142,6 +186,21 @@ def a_failed_cell_does_not_take_the_others_along(bench, monkeypatch):
     assert "| steps=2 | 2 | 2 |" in outcome.out
 
 
+def test_a_scene_that_cannot_be_opened_does_not_take_the_others_along(bench, monkeypatch):
+    honest = DataSource.open
+
+    def opened(self, scene, *more):
+        if scene == SCENES[0]:
+            raise BadInput(f"{scene}: a planted fault")
+        return honest(self, scene, *more)
+
+    monkeypatch.setattr(DataSource, "open", opened)
+    outcome = ablate(bench, "--vary", "steps=2", "--seed", "0", "--scene", *SCENES)
+    assert outcome.status == 1
+    assert "| steps=2 | 1 | 1 of 2 |" in outcome.out
+    assert f"{SCENES[0]}: a planted fault" in outcome.out
+
+
 def test_a_rung_can_keep_what_the_plan_would_leave_out(bench):
     """And shares nothing with one that does not keep it."""
     ladder = registry.load("ladder", "inpainthuman")["plan"]
@@ -156,8 +215,6 @@ def test_a_rung_can_keep_what_the_plan_would_leave_out(bench):
 
 def test_rungs_that_begin_alike_share_their_first_stage_and_its_seconds(bench):
     """With and without sharing the scores are the same to the last bit."""
-    from dataclasses import replace
-
     words = ("--vary", "refine.steps=0:4", "--seed", "0", "--scene", SCENES[0])
     painted = ("steps=6", "inpaint.filler=mirror", "inpaint.key_views=2")
     apart = replace(bench, runs=bench.runs.parent / "apart")
@@ -173,6 +230,31 @@ def test_rungs_that_begin_alike_share_their_first_stage_and_its_seconds(bench):
     assert events[1]["shared"] == {"state": "stage1", "run": read_json(bench.folders()[0] / "run.json")["digest"]}
     stages = [read_json(folder / "run.json")["ledger"]["stages"] for folder in bench.folders()]
     assert stages[1]["fit/stage1"]["seconds"] >= 0.5 * stages[0]["fit/stage1"]["seconds"]
+
+
+def test_nothing_is_lent_across_clocks_or_other_beginnings(tmp_path):
+    """A state brings its seconds along: they must be of such a machine, with as many threads."""
+    here = {"cpu": "one", "gpu": None, "torch_threads": 1}
+
+    def run(name, machine=here, status="done", **config):
+        identity = {"seed": 0, "config": {"steps": 3, "inpaint": {"on": True}, "keep": [], **config}}
+        folder = RunFolder(tmp_path / name, {"status": status, "identity": identity, "machine": machine})
+        return folder
+
+    def found(lending):
+        (tmp_path / "lends" / "checkpoints").mkdir(parents=True, exist_ok=True)
+        (tmp_path / "lends" / "checkpoints" / "stage1.safetensors").touch()
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(RunFolder, "open", lambda path: lending)
+            return lender(tmp_path, run("borrows", keep=["inpaint.on"]), "stage1", ("inpaint.",), here)
+
+    good = run("lends", inpaint={"on": False})
+    assert found(good) is good
+    for change in ({"torch_threads": 2}, {"cpu": "two"}, {"gpu": "some"}):
+        assert found(run("lends", here | change)) is None
+    assert found(run("lends", steps=4)) is None
+    assert found(run("lends", keep=["levels"])) is None
+    assert found(run("lends", status="failed")) is None
 
 
 def test_what_happened_in_a_lent_stage_is_told_of_the_borrower_too(tmp_path):

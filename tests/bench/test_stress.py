@@ -192,13 +192,16 @@ def test_a_case_beyond_its_tolerance_fails_or_is_known():
 
 
 def test_exceptions_and_warnings_are_failures():
-    assert run_case(replace(OK, function=lambda: 1 / 0)).reason == "raised ZeroDivisionError: division by zero"
+    crash = replace(OK, function=lambda: 1 / 0)  # pyright: ignore
+    assert run_case(crash).reason == "raised ZeroDivisionError: division by zero"
+    assert run_case(replace(crash, known="nobody minds")).verdict == "failed"  # what is known is an answer, no crash
 
     def warns():
         warnings.warn("0/0", RuntimeWarning, stacklevel=1)
         return Answer(1.0, 1.0)
 
     assert run_case(replace(OK, function=warns)).reason == "raised RuntimeWarning: 0/0"
+    assert run_case(replace(OK, function=warns, known="overflows")).verdict == "known"
     assert words_of(BadInput, lambda: None) == "was not refused"
     with pytest.raises(ZeroDivisionError):
         words_of(BadInput, lambda: 1 / 0)

@@ -12,7 +12,7 @@ from ihbench.results import RunResult
 
 PSNR, FLIP = "psnr/pooled/range1/{}/v1", "flip/ldr-67ppd/srgb/{}/v1"
 REGIONS = ("body", "hidden")
-QUIET = {"cpu": "a processor", "cores_usable": 4, "gpu": None, "load_average": [0.5, 0.5, 0.5]}
+QUIET = {"cpu": "a processor", "cores": 4, "cores_usable": 4, "gpu": None, "load_average": [0.5, 0.5, 0.5]}
 BEGAN = datetime.fromisoformat("2025-01-01T00:00:00+00:00")
 
 

@@ -196,7 +196,7 @@ def test_views_that_a_mean_does_not_run_over_are_counted():
 def test_what_was_left_out_is_said_once():
     left_out = [{"field": "levels", "value": [16], "reason": "too fine"}]
     text = write([run("a", left_out=left_out), run("b", left_out=left_out)])
-    assert text.count("- left out: levels → [16]: too fine") == 1
+    assert text.count("- left out, ours on a, b: levels → [16]: too fine") == 1
 
 
 def test_words_from_elsewhere_cannot_break_the_table():
@@ -227,7 +227,12 @@ def test_too_few_scenes_cannot_be_significant_and_one_has_no_interval():
     runs = [
         run(f"s{k}", name, psnr=value + k) for k in range(3) for name, value in (("ours", 30.0), ("theirs", 10.0))
     ]
-    assert "cannot be significant: 3 scenes allow no p below 0.25" in write(runs)
+    assert "cannot be significant: 3 scenes allow no adjusted p below 0.25" in write(runs)
+    # six scenes would do for one comparison, but not for two
+    six = [run(f"s{k}", name, psnr=v + k) for k in range(6) for name, v in (("a", 30.0), ("b", 20.0), ("c", 10.0))]
+    text = write(six)
+    assert "cannot be significant: 6 scenes allow no adjusted p below 0.062" in text
+    assert "would be found" not in text
     assert "interval" not in write([run()])
 
 
@@ -248,3 +253,11 @@ def test_predictions_are_labelled_and_have_no_fit_time():
     result = run(fit_seconds=None)
     result.record["about"]["provenance"] = "predictions"
     assert row(write([result]), "ours (predictions)")["fit s"] == "—"
+
+
+def test_seconds_of_two_machines_have_no_mean_in_the_main_table():
+    a, b = run(), run(seed=1)
+    for made, cpu in ((a, "fast"), (b, "slow")):
+        made.record["machine"] = {"cpu": cpu, "cores_usable": 4}
+    cells = row(write([a, b]), "ours")
+    assert (cells["fit s"], cells["total s"]) == ("—", "—")

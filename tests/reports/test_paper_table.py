@@ -202,15 +202,18 @@ def ablated(config, **about):
     return dict(zip(found.components, found.rows[0].components, strict=True))
 
 
+def switches(levels=(64, 128), on=True, ti=True, sg=True, filler="diffusion"):
+    return {"levels": list(levels), "inpaint": {"on": on, "ti": ti, "sg": sg, "filler": filler}}
+
+
 def test_components_are_told_from_the_switches():
-    full = {"levels": [64, 128], "inpaint": {"on": True, "ti": True, "sg": False}}
-    assert ablated(full) == {"MS Maps": "✓", "TI": "✓", "SG": "", "inpainting": "✓"}
-    off = {"levels": [128], "inpaint": {"on": False, "ti": True, "sg": True}}
-    assert ablated(off) == {"MS Maps": "", "TI": "", "SG": "", "inpainting": ""}
+    assert ablated(switches(sg=False)) == {"MS Maps": "✓", "TI": "✓", "SG": "", "inpainting": "✓"}
+    assert ablated(switches([128], on=False)) == {"MS Maps": "", "TI": "", "SG": "", "inpainting": ""}
+    # a simple filler knows neither a word nor a part map
+    assert ablated(switches(filler="mirror")) == {"MS Maps": "✓", "TI": "", "SG": "", "inpainting": "✓"}
     assert set(ablated({"steps": 3}).values()) == {"?"}
 
 
 def test_what_the_plan_left_out_is_not_there():
-    full = {"levels": [64, 128], "inpaint": {"on": True, "ti": True, "sg": True}}
     left_out = [{"field": "inpaint.on", "value": False, "reason": "nothing hidden"}]
-    assert ablated(full, left_out=left_out) == {"MS Maps": "✓", "TI": "", "SG": "", "inpainting": ""}
+    assert ablated(switches(), left_out=left_out) == {"MS Maps": "✓", "TI": "", "SG": "", "inpainting": ""}

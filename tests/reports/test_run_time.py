@@ -66,9 +66,16 @@ def test_rows_are_compared_only_over_scenes_that_all_have(tmp_path):
     runs.append(made_up(tmp_path, "a", "theirs", psnr=21.0))
     text = section(runs)
     assert cells(text, "ours")["PSNR ↑"] == "20.00"
-    assert "1 scene that all rows have" in text
-    apart = section([made_up(tmp_path, "a"), made_up(tmp_path, "b", "theirs")])
-    assert "no scene in common" in apart
+    assert "1 scene that all these rows have" in text
+
+
+def test_one_odd_row_does_not_take_the_comparison_of_the_others(tmp_path):
+    runs = [made_up(tmp_path, s, m, psnr=20.0) for s in ("a", "b", "c") for m in ("ours", "theirs")]
+    runs.append(made_up(tmp_path, "z", "trial", psnr=21.0))
+    text = section(runs)
+    assert cells(text, "ours")["runs"] == cells(text, "theirs")["runs"] == "3"
+    assert "Not here, because they lack some of these scenes: trial." in text
+    assert "| trial" not in text
 
 
 def test_seconds_of_two_machines_are_never_one_mean(tmp_path):
@@ -79,13 +86,26 @@ def test_seconds_of_two_machines_are_never_one_mean(tmp_path):
     assert "machine B: a slower one, 4 cores" in text
 
 
+def test_another_number_of_threads_is_another_clock(tmp_path):
+    runs = [
+        made_up(tmp_path, "a", seed=k, fit=f, machine={"torch_threads": t}) for k, f, t in ((0, 10, 4), (1, 40, 1))
+    ]
+    text = section(runs)
+    assert cells(text, "ours on A")["fit s"] == "10"
+    assert "4 cores, 4 threads" in text
+    assert "4 cores, 1 thread;" in text
+
+
 def test_unstable_is_said_when_repeats_or_the_load_say_so_and_only_then(tmp_path):
     calm = [made_up(tmp_path, seed=k, fit=f) for k, f in enumerate((40, 44))]
     assert "unstable" not in section(calm)
     apart = [made_up(tmp_path, seed=k, fit=f) for k, f in enumerate((40, 60))]
     assert "unstable seconds: repeats 40% of their median apart: ours" in section(apart)
-    busy = [made_up(tmp_path, machine={"load_average": [9.0, 1.0, 1.0]})]
-    assert "unstable seconds: 1 of 1 runs on a busy machine (load up to 2.2 per core): ours" in section(busy)
+    for when in ("load_average", "load_average_end"):  # also what came while it ran
+        busy = [made_up(tmp_path, machine={when: [9.0, 1.0, 1.0]})]
+        assert "unstable seconds: 1 of 1 runs on a busy machine (load up to 2.2 per core): ours" in section(busy)
+    pinned = [made_up(tmp_path, machine={"load_average_end": [4.0, 1.0, 1.0], "cores_usable": 1})]
+    assert "unstable" not in section(pinned)  # the load is the whole machine's
 
 
 def test_runs_without_a_fit_time_have_no_section(tmp_path):

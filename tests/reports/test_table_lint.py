@@ -257,6 +257,23 @@ def test_claims_within_noise(first, second, told, tmp_path):
         assert lines_of(rows, tmp_path, ["Method", "PSNR ↑"], before="ihbench lint: paired") == []
 
 
+@pytest.mark.parametrize(
+    ("first", "second", "third", "finding"),
+    [
+        ("!24.80 ± 0.30", "!24.65 ± 0.30", "22.10 ± 0.30", ""),  # as the linter itself advises
+        ("!24.80 ± 0.30", "!24.65 ± 0.30", "_22.10 ± 0.30", ""),
+        ("24.80 ± 0.30", "24.65 ± 0.30", "22.10 ± 0.30", ""),  # no claim at all
+        ("!24.80 ± 0.30", "!22.10 ± 0.30", "_22.00 ± 0.01", "Two, PSNR ↑: wrong best mark"),
+        ("!24.80 ± 0.01", "24.60 ± 0.01", "_22.10 ± 0.01", "Three, PSNR ↑: wrong second-best mark"),
+    ],
+)
+def test_rows_within_noise_may_share_the_best_mark(first, second, third, finding, tmp_path):
+    rows = [["One", first], ["Two", second], ["Three", third], ["Four", "20.00 ± 0.01"]]
+    lines = lines_of(rows, tmp_path, ["Method", "PSNR ↑"])
+    assert bool(lines) == bool(finding)
+    assert not finding or any(line.startswith(finding) for line in lines)
+
+
 def test_a_statement_that_marks_are_paired_excuses_no_wrong_one(tmp_path):
     rows = [["One", "!20.0 ± 0.5"], ["Two", "24.2 ± 0.5"], ["Three", "18.0 ± 0.5"]]
     (line,) = lines_of(rows, tmp_path, ["Method", "PSNR ↑"], before="ihbench lint: paired")

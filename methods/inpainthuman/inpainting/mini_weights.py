@@ -36,7 +36,7 @@ def save_mini(backbone: Backbone, folder: Path) -> None:
 def load_mini(folder: Path | None = None, device: str = "cpu") -> Backbone:
     """The shipped backbone, or one that `ihbench train-mini` wrote, frozen. Raises `BadInput` for another folder, and
     for weights that are damaged, missing, superfluous or not finite: none is made up."""
-    folder, configs = check_mini(SHIPPED if folder is None else folder)
+    found, configs = check_mini(SHIPPED if folder is None else folder)
     from diffusers import ControlNetModel, DDIMScheduler, UNet2DConditionModel
 
     from ihbench.methods.inpainthuman.inpainting.block_transform import BlockTransform
@@ -45,22 +45,22 @@ def load_mini(folder: Path | None = None, device: str = "cpu") -> Backbone:
 
     def part(name: str, kind: Any) -> Any:
         with quiet_libraries():
-            module = empty_module(folder / name, lambda: kind.from_config(configs[name]))
-        return UnreadModule(module, folder / name, STEMS[name]).read(place, torch.float32)
+            module = empty_module(found / name, lambda: kind.from_config(configs[name]))
+        return UnreadModule(module, found / name, STEMS[name]).read(place, torch.float32)
 
-    tokenizer = mini_tokenizer(folder)
+    tokenizer = mini_tokenizer(found)
     known = configs["text_encoder"].get("vocab_size")
     if not isinstance(known, int) or len(tokenizer) > known:
         raise BadInput(
-            f"{folder / 'tokenizer'}: {len(tokenizer)} words, but the text encoder has {known}; take both from one "
+            f"{found / 'tokenizer'}: {len(tokenizer)} words, but the text encoder has {known}; take both from one "
             f"training"
         )
-    with _readable(folder / "scheduler"):
-        scheduler: Any = DDIMScheduler.from_pretrained(folder / "scheduler")
+    with _readable(found / "scheduler"):
+        scheduler: Any = DDIMScheduler.from_pretrained(found / "scheduler")
     return Backbone(
         name="mini",
         unet=part("unet", UNet2DConditionModel),
-        text_encoder=unread_text_encoder(folder / "text_encoder", configs["text_encoder"]).read(place, torch.float32),
+        text_encoder=unread_text_encoder(found / "text_encoder", configs["text_encoder"]).read(place, torch.float32),
         tokenizer=tokenizer,
         controlnet=part("controlnet", ControlNetModel),
         codec=part("codec", BlockTransform),

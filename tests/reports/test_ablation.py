@@ -1,0 +1,88 @@
+"""The ablation table: what is paired, what can be significant, what seconds may be compared."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from ihbench.ablation import Comparison, Ladder, Rung
+from ihbench.reports.ablation import write
+from tests.reports.made_up_runs import made_up
+
+SCENES = tuple("abcdef")
+IDENTITY = "psnr/pooled/range1/hidden/v1"
+
+
+def told(runs, comparisons=(("step", "low", "high"),)):
+    """The text and numbers of made-up runs by rung."""
+    ladder = Ladder("made up", tuple(Rung(name) for name in runs), tuple(Comparison(*c) for c in comparisons))
+    request = SimpleNamespace(protocol=SimpleNamespace(name="p@1", profile="quick"), method="ours")
+    cell = SimpleNamespace(request=request, name="a cell")
+    found = [
+        (rung, SimpleNamespace(cell=cell, result=run, done=run is not None, problem="lost"))
+        for rung, having in runs.items()
+        for run in having
+    ]
+    text, numbers = write(ladder, found)  # pyright: ignore
+    return text, numbers["tables"][0]
+
+
+def rung(tmp_path, psnr, scenes=SCENES, seeds=(0,), **more):
+    return [made_up(tmp_path, s, psnr=psnr + k + n, seed=n, **more) for k, s in enumerate(scenes) for n in seeds]
+
+
+def test_a_difference_beyond_doubt_is_marked(tmp_path):
+    text, table = told({"low": rung(tmp_path, 20), "high": rung(tmp_path, 22)})
+    (row,) = table["comparisons"]
+    assert row["scores"][IDENTITY]["mean"] == pytest.approx(2)
+    assert "| step | 6 | +2.00* [" in text
+    assert "nothing can be marked" not in text
+
+
+def test_with_too_many_comparisons_for_the_scenes_it_says_so(tmp_path):
+    runs = {name: rung(tmp_path, 20 + k) for k, name in enumerate(("low", "mid", "high"))}
+    text, _ = told(runs, (("first", "low", "mid"), ("both", "low", "high")))
+    assert "*" not in text.partition("What each component")[2].partition("[95%")[0]
+    assert "no adjusted p can be below 0.062, so nothing can be marked" in text
+
+
+def test_what_one_rung_lost_is_not_compared(tmp_path):
+    """Seed 1 is a decibel better in every scene; a rung that lost it in one scene is not worse for that."""
+    high = rung(tmp_path, 20, seeds=(0, 1))
+    low = [run for run in rung(tmp_path, 20, seeds=(0, 1)) if (run.scene, run.identity["seed"]) != ("a", 1)]
+    _, table = told({"low": [*low, None], "high": high})
+    score = table["comparisons"][0]["scores"][IDENTITY]
+    assert (score["mean"], score["low"], score["high"]) == pytest.approx((0, 0, 0))
+    assert table["rungs"]["low"]["runs"] == 11
+
+
+def test_one_scene_has_a_difference_without_interval(tmp_path):
+    text, table = told({"low": rung(tmp_path, 20, "a", (0, 1)), "high": rung(tmp_path, 21.5, "a", (0, 1))})
+    assert "| step | 1 | +1.50 |" in text
+    assert "One scene: differences have no interval and no test." in text
+    assert table["comparisons"][0]["scores"][IDENTITY]["p"] is None
+    assert table["comparisons"][0]["fit_seconds"]["mean"] == 0
+
+
+def test_seconds_of_two_clocks_are_not_compared(tmp_path):
+    other = {"cpu": "a slower one", "load_average": [40.0, 1.0, 1.0]}
+    text, table = told({"low": rung(tmp_path, 20, fit=100), "high": rung(tmp_path, 22, fit=400, machine=other)})
+    assert table["comparisons"][0]["fit_seconds"] is None
+    assert (table["rungs"]["low"]["fit_seconds"]["mean"], table["rungs"]["high"]["fit_seconds"]["mean"]) == (100, 400)
+    assert "- machine B: a slower one, 4 cores; load average at the start 40.0 to 40.0" in text
+    assert "unstable seconds: 6 of 6 runs on a busy machine (load up to 10.0 per core): high" in text
+    mixed = rung(tmp_path, 20, "abc") + rung(tmp_path, 20, "def", machine=other)
+    assert told({"low": mixed, "high": mixed})[1]["rungs"]["low"]["fit_seconds"] is None
+
+
+def test_what_the_plan_left_out_of_a_rung_is_said(tmp_path):
+    high = rung(tmp_path, 22)
+    for run in high[:2]:
+        run.record["about"]["left_out"] = [
+            {"field": "levels", "value": [64, 128], "reason": "small"},
+            {"field": "never_seen", "value": None, "reason": "no such surface"},
+        ]
+    text, table = told({"low": rung(tmp_path, 20), "high": high})
+    assert "- left out by the plan, high: levels → 64+128 in 2 of 6 runs\n" in text
+    assert table["rungs"]["high"]["left_out"] == {"levels → 64+128": 2}
