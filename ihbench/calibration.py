@@ -55,7 +55,7 @@ class Calibration:
         count = np.zeros(len(texels.face))
         person_sum, person_count = np.zeros(3), 0
         for view in views:
-            nearest, row, column = surface_texels(body.pose(view.body_pose), body, texels, view)
+            nearest, row, column, _ = surface_texels(body.pose(view.body_pose), body, texels, view)
             seen = nearest & (view.mask[row, column] == MaskState.PERSON)
             total[seen] += view.image[row[seen], column[seen]]
             count += seen

@@ -62,8 +62,9 @@ def surface_texels(
     body: Body,
     texels: Texels,
     view: MaskedView,
-) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
-    """(nearest [N], row [N], column [N]): texels that are the nearest surface in this view, and their pixels."""
+) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """(nearest [N], row [N], column [N], cosine [N]): texels that are the nearest surface in this view and not seen
+    too obliquely, their pixels, and the cosine between normal and direction to the camera."""
     camera = view.camera
     projected = camera.project(vertices)
     depth = rasterize(projected, body.faces, camera.height, camera.width).depth
@@ -77,8 +78,8 @@ def surface_texels(
     inside = (p[:, 2] > 0) & (p[:, 0] >= 0) & (p[:, 0] < camera.width) & (p[:, 1] >= 0) & (p[:, 1] < camera.height)
     column = np.where(inside, p[:, 0], 0).astype(np.int64)
     row = np.where(inside, p[:, 1], 0).astype(np.int64)
-    facing = (normals * to_camera).sum(1) > FACING
-    return inside & facing & (p[:, 2] <= depth[row, column] + DEPTH_SLACK), row, column
+    cosine = (normals * to_camera).sum(1)
+    return inside & (cosine > FACING) & (p[:, 2] <= depth[row, column] + DEPTH_SLACK), row, column, cosine
 
 
 def texel_visibility(views: Iterable[MaskedView], body: Body, texels: Texels) -> Visibility:
@@ -86,7 +87,7 @@ def texel_visibility(views: Iterable[MaskedView], body: Body, texels: Texels) ->
     faced = np.zeros(len(texels.face), np.int32)
     seen = np.zeros(len(texels.face), np.int32)
     for view in views:
-        nearest, row, column = surface_texels(body.pose(view.body_pose), body, texels, view)
+        nearest, row, column, _ = surface_texels(body.pose(view.body_pose), body, texels, view)
         state = view.mask[row, column]
         # a texel over known background is neither: the fitted body sticks out of the person there
         faced += nearest & (state != MaskState.BACKGROUND)

@@ -37,7 +37,7 @@ class Stage2:
         if saved is not None:
             return saved
         with self.ledger.stage("look"):
-            surface = seen_surface(self.training, TEXELS)
+            surface = seen_surface(self.training, TEXELS, self.config.facing)
             shown = self._shown(surface)
         if not shown:
             return self._nothing("no training view hides surface that needs a painter")
@@ -86,7 +86,7 @@ class Stage2:
             hidden = [k for k in range(len(views)) if (views[k].mask == MaskState.UNKNOWN).any()]
             keys = set(key_views(surface.faced, np.ones(len(surface.views), bool), config.key_views))
             return {k: views[k] for k in hidden if k in keys}
-        chosen = key_views(surface.faced, surface.unseen, config.key_views)
+        chosen = key_views(surface.faced, surface.needed, config.key_views)
         shown = {k: with_known_surface(views[k], training, self.avatar, surface) for k in chosen}
         clearest = min(range(len(views)), key=lambda k: int((views[k].mask == MaskState.UNKNOWN).sum()))
         for turn in range(config.turntable):

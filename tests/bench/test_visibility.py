@@ -66,7 +66,7 @@ def test_a_ray_caster_agrees(distortion):
     """From the side an arm hangs close before the body. The z-buffer knows depth at pixel centres only, hence the
     slack of a few percent near outlines."""
     camera, pose = a_camera(1.2, 256, distortion=distortion), arms_down()
-    nearest, row, column = surface_texels(BODY.pose(pose), BODY, TEXELS, train_view(camera, pose))
+    nearest, row, column, _ = surface_texels(BODY.pose(pose), BODY, TEXELS, train_view(camera, pose))
     place, facing = TEXELS.interpolate(BODY.v_template, BODY.faces), cosine(camera, pose)
     trunk = (np.abs(place[:, 0]) < 0.22) & (place[:, 1] > -0.1) & (place[:, 1] < 0.45)
     chosen = np.flatnonzero(trunk & (facing > FACING))

@@ -14,11 +14,12 @@ from ihbench.methods.inpainthuman.inpainting.crop_view import cut_view, with_fra
 from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
 from ihbench.methods.inpainthuman.inpainting.painted_view import paste_back
 from ihbench.methods.inpainthuman.inpainting.shown_view import orbit, turntable_view, with_known_surface
-from ihbench.methods.inpainthuman.inpainting.surface_need import SeenSurface, key_views, seen_surface, unseen_pixels
+from ihbench.methods.inpainthuman.inpainting.surface_need import SeenSurface, key_views, pixels_of, seen_surface
 from ihbench.methods.inpainthuman.stage2 import Stage2
 from ihbench.progress import Progress
 from ihbench.scene import MaskState
 from ihbench.threads import one_torch_thread
+from ihbench.visibility import surface_texels
 from tests.bench.fake_capture import a_camera, a_pose, the_body, train_view
 from tests.methods.tiny_fit import SIZE, an_avatar, shaken, training_set, training_views
 
@@ -48,7 +49,7 @@ class TestNeed:
         training = one_sided()
         surface = seen_surface(training, 64)
         view = training.views[0]
-        unseen = unseen_pixels(the_body().pose(view.body_pose), the_body(), view.camera, surface)
+        unseen = pixels_of(surface.map_of(surface.unseen), the_body().pose(view.body_pose), the_body(), view.camera)
         hidden, body = view.mask == MaskState.UNKNOWN, view.mask == MaskState.PERSON
         assert unseen[hidden].sum() > 40
         assert not unseen[body].mean() > 0.05  # the rim is seen too obliquely to count
@@ -57,15 +58,29 @@ class TestNeed:
         views = [*one_sided().views, train_view(a_camera(0.0, SIZE), a_pose(0.0, 0.0), None, frame=9)]
         surface = seen_surface(training_set(views), 64)
         view = views[0]
-        unseen = unseen_pixels(the_body().pose(view.body_pose), the_body(), view.camera, surface)
+        unseen = pixels_of(surface.map_of(surface.unseen), the_body().pose(view.body_pose), the_body(), view.camera)
         hidden = view.mask == MaskState.UNKNOWN
         assert (unseen & hidden).sum() < 0.1 * hidden.sum()
 
     def test_a_body_nowhere_in_the_image(self):
         training = one_sided()
-        surface = seen_surface(training, 64)
         away = the_body().pose(a_pose(0.0, 0.0)) + np.array([50.0, 0, 0])
-        assert not unseen_pixels(away, the_body(), training.views[0].camera, surface).any()
+        everything = np.ones((64, 64), bool)
+        assert not pixels_of(everything, away, the_body(), training.views[0].camera).any()
+        here = the_body().pose(training.views[0].body_pose)
+        assert pixels_of(everything, here, the_body(), training.views[0].camera).any()
+
+    def test_surface_seen_at_a_glancing_angle_only_needs_no_painter(self):
+        training = one_sided()
+        everything, well = (seen_surface(training, 64, facing) for facing in (0.0, 0.7))
+        best = np.zeros(len(well.views))
+        for view in training.views:
+            nearest, *_, cosine = surface_texels(the_body().pose(view.body_pose), the_body(), well.texels, view)
+            best = np.maximum(best, np.where(nearest, cosine, 0))
+        assert (everything.unseen == well.unseen).all()
+        assert (everything.needed <= everything.unseen).all()
+        assert (well.needed == everything.needed & (best >= 0.7)).all()
+        assert 10 < well.needed.sum() < everything.needed.sum()
 
     def test_key_views_cover_every_needed_texel(self):
         faced = [np.arange(0, 10), np.arange(0, 10), np.arange(5, 20), np.arange(18, 30), np.arange(0, 0)]
@@ -251,11 +266,12 @@ class TestStage2:
         assert all(view.view.frame == -1 for view in painted if view.index >= 3)
 
 
-def test_seen_map_reaches_beyond_the_charts():
+def test_a_map_of_texels_reaches_beyond_the_charts():
     surface = seen_surface(one_sided(), 64)
     assert isinstance(surface, SeenSurface)
     table = texel_table(the_body(), 64)
     on = table.mask
-    assert (surface.map[on] == (surface.views > 0)).all()
-    assert surface.map[~on].any()
+    unseen = surface.map_of(surface.unseen)
+    assert (unseen[on] == (surface.views == 0)).all()
+    assert unseen[~on].any()
     assert stage2.TEXELS >= 64

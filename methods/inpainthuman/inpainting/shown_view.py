@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ihbench.body import Body
 from ihbench.camera import Camera
-from ihbench.methods.inpainthuman.inpainting.surface_need import SeenSurface, unseen_pixels
+from ihbench.methods.inpainthuman.inpainting.surface_need import SeenSurface, pixels_of
 from ihbench.scene import BodyPose, MaskState, TrainingSet, TrainView
 
 Background = tuple[float, float, float]
@@ -23,11 +23,12 @@ class Renderer(Protocol):
 
 
 def with_known_surface(view: TrainView, training: TrainingSet, avatar: Renderer, surface: SeenSurface) -> TrainView:
-    """The view with the avatar drawn into those hidden pixels whose surface other frames show. Only what no frame
-    shows stays UNKNOWN."""
+    """The view with the avatar drawn into those hidden pixels that need no painter. Only surface that no frame shows,
+    though one faces it well, stays UNKNOWN."""
     body = training.body
     hidden = view.mask == MaskState.UNKNOWN
-    wanted = hidden & unseen_pixels(body.pose(view.body_pose), body, view.camera, surface)
+    needed = surface.map_of(surface.needed)
+    wanted = hidden & pixels_of(needed, body.pose(view.body_pose), body, view.camera)
     known = hidden & ~wanted
     rgb, alpha = avatar.render(view.camera, view.body_pose, training.background)
     image, mask = view.image.copy(), view.mask.copy()
@@ -50,7 +51,7 @@ def turntable_view(
     vertices = body.pose(like.body_pose)
     rgb, alpha = avatar.render(camera, like.body_pose, training.background)
     mask = np.where(alpha >= 0.5, MaskState.PERSON, MaskState.BACKGROUND).astype(np.uint8)
-    mask[unseen_pixels(vertices, body, camera, surface)] = MaskState.UNKNOWN
+    mask[pixels_of(surface.map_of(surface.unseen), vertices, body, camera)] = MaskState.UNKNOWN
     image = np.rint(rgb * 255).astype(np.uint8)
     return TrainView(image, mask, camera, like.body_pose, -1, f"turntable-{round(np.degrees(angle))}")
 

@@ -39,7 +39,7 @@ class FacedTexels:
 def faced_texels(view: CropView, body: Body, texels: Texels) -> FacedTexels:
     """`ihbench.visibility`'s rules for what is the nearest surface, at the crop's size."""
     vertices = body.pose(view.body_pose)
-    nearest, _, _ = surface_texels(vertices, body, texels, _train_view(view))
+    nearest, *_ = surface_texels(vertices, body, texels, _train_view(view))
     corners = vertices[body.faces[texels.face[nearest]]]
     points = np.einsum("nk,nkd->nd", texels.bary[nearest], corners)
     return FacedTexels(np.flatnonzero(nearest).astype(np.int32), view.camera.project(points)[:, :2])

@@ -1,6 +1,8 @@
 """Which hidden pixels need a painter: those whose surface no training view shows (design section 6).
 
-Hidden pixels whose surface another frame shows need none: stage 1 has learned their colour from that frame.
+Hidden pixels whose surface another frame shows need none: stage 1 has learned their colour from that frame. Surface
+that all training views would see at a glancing angle only is left to stage 1 too: a few painted pixels on the rim
+would decide the colour of what is wide from elsewhere.
 """
 
 from __future__ import annotations
@@ -29,39 +31,52 @@ class SeenSurface:
 
     texels: Texels
     views: NDArray[np.int32]  # [N] training views that show the texel un-occluded
-    faced: tuple[NDArray[np.int64], ...]  # per training view: texels that are the nearest surface but hidden there
-    map: NDArray[np.bool_]  # [R, R] seen; off the charts the nearest texel's value
+    faced: tuple[NDArray[np.int64], ...]  # per training view: texels that face it well, but are hidden there
 
     @property
     def unseen(self) -> NDArray[np.bool_]:
+        """[N] shown by no training view."""
         return self.views == 0
 
+    @property
+    def needed(self) -> NDArray[np.bool_]:
+        """[N] shown by no training view, though one would face it well: what can be painted in training views."""
+        out = np.zeros(len(self.views), bool)
+        for texels in self.faced:
+            out[texels] = True
+        return out & self.unseen
 
-def seen_surface(training: TrainingSet, resolution: int) -> SeenSurface:
-    """Look through all training views."""
+    def map_of(self, texels: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """[R, R] a property of the texels [N] as an image; off the charts the nearest texel's value."""
+        size = self.texels.resolution
+        flat = np.zeros(size**2, bool)
+        flat[self.texels.index] = texels
+        nearest = distance_transform_edt(~self.texels.mask, return_distances=False, return_indices=True)
+        return flat.reshape(size, size)[tuple(np.asarray(nearest))]
+
+
+def seen_surface(training: TrainingSet, resolution: int, facing: float = 0.0) -> SeenSurface:
+    """Look through all training views. A texel faces a view well if the cosine between its normal and the direction
+    to the camera is at least `facing`."""
     body = training.body
     texels = texel_table(body, resolution)
     count = np.zeros(len(texels.face), np.int32)
     faced = []
     for view in training.views:
-        nearest, row, column = surface_texels(body.pose(view.body_pose), body, texels, view)
+        nearest, row, column, cosine = surface_texels(body.pose(view.body_pose), body, texels, view)
         state = view.mask[row, column]
         count += nearest & (state == MaskState.PERSON)
-        faced.append(np.flatnonzero(nearest & (state == MaskState.UNKNOWN)))
-    flat = np.zeros(resolution**2, bool)
-    flat[texels.index] = count > 0
-    seen = flat.reshape(resolution, resolution)
-    nearest_chart = distance_transform_edt(~texels.mask, return_distances=False, return_indices=True)
-    return SeenSurface(texels, count, tuple(faced), seen[tuple(np.asarray(nearest_chart))])
+        faced.append(np.flatnonzero(nearest & (cosine >= facing) & (state == MaskState.UNKNOWN)))
+    return SeenSurface(texels, count, tuple(faced))
 
 
-def unseen_pixels(
+def pixels_of(
+    wanted: NDArray[np.bool_],  # [R, R] texels, also off the charts
     vertices: NDArray[np.float64],  # [V, 3] m world, the posed body
     body: Body,
     camera: Camera,
-    surface: SeenSurface,
 ) -> NDArray[np.bool_]:
-    """[H, W] pixels on or beside the body whose nearest surface no training view shows."""
+    """[H, W] pixels on or beside the body whose nearest surface is wanted."""
     raster = rasterize(camera.project(vertices), body.faces, camera.height, camera.width)
     on = raster.face >= 0
     out = np.zeros(on.shape, bool)
@@ -69,10 +84,10 @@ def unseen_pixels(
         return out
     corners = body.uv[body.uv_faces[raster.face[on]]]
     uv = np.einsum("nk,nkd->nd", raster.bary[on], corners)
-    size = len(surface.map)
+    size = len(wanted)
     column = np.clip((uv[:, 0] * size).astype(int), 0, size - 1)
     row = np.clip(((1 - uv[:, 1]) * size).astype(int), 0, size - 1)
-    out[on] = ~surface.map[row, column]
+    out[on] = wanted[row, column]
     out = median_filter(out, size=3) & on  # a lone texel is not worth a painter
     nearest = distance_transform_edt(~on, return_distances=False, return_indices=True)
     distance = distance_transform_edt(~on)
