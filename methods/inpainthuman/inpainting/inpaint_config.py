@@ -83,9 +83,10 @@ class InpaintConfig:
     trust: float = 0.8
     """Weight of the painter's colours; the rest is the stage-1 avatar's own guess, which errs differently. 1: the
     painter alone (the paper). With context "seen" only."""
-    facing: float = 0.5
+    facing: float = 0.0
     """Only surface is painted that faces some training view, hidden, by at least this cosine; what all views would
-    see at a glancing angle keeps stage 1's colours. 0: all of it (the paper). With context "seen"."""
+    see at a glancing angle keeps stage 1's colours. 0: all of it (the paper). 0.5 is better where the person hardly
+    turns, and worse where stage 1 leaves holes. With context "seen"."""
     key_views: int = 40
     """Frames painted at most, chosen to see all of the surface that needs it; 0 for every frame that sees some."""
     turntable: int = 0
@@ -172,4 +173,4 @@ OWN: dict[str, dict[str, Any]] = {
 LORA_OF_MINI = 1e-3  # step size: so few weights need longer steps
 
 QUICK_INPAINT = InpaintConfig()
-PAPER_INPAINT = InpaintConfig(ti_steps=1000, lora_steps=2000, trust=1.0, facing=0.0, key_views=0)
+PAPER_INPAINT = InpaintConfig(ti_steps=1000, lora_steps=2000, trust=1.0, key_views=0)

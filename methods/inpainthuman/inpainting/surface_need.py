@@ -1,8 +1,8 @@
 """Which hidden pixels need a painter: those whose surface no training view shows (design section 6).
 
 Hidden pixels whose surface another frame shows need none: stage 1 has learned their colour from that frame. Surface
-that all training views would see at a glancing angle only is left to stage 1 too: a few painted pixels on the rim
-would decide the colour of what is wide from elsewhere.
+that all training views would see at a glancing angle only may be left to stage 1 too: a few painted pixels on the rim
+decide the colour of what is wide from elsewhere.
 """
 
 from __future__ import annotations
