@@ -12,6 +12,7 @@ from ihbench import atomic, registry
 from ihbench.atomic import read_json, read_json_lines
 from ihbench.calibration import ROWS, Calibration
 from ihbench.data_source import locate
+from ihbench.methods.inpainthuman.config import QUICK
 from ihbench.metrics import psnr
 from ihbench.progress import Progress
 from ihbench.protocol import load_protocol
@@ -234,20 +235,39 @@ def test_without_an_occluder_no_surface_is_hidden_and_the_table_says_why(bench, 
     assert about["measure"]["hidden_texels"] == about["hidden_share"] == 0
     assert [o["field"] for o in about["left_out"]] == ["hidden"]
     assert math.isnan(means(folder, "mannequin")["psnr/pooled/range1/hidden/v1"])
-    assert "left out: hidden → None: every texel that faced the training camera was also seen" in outcome.out
+    assert (
+        "left out, mannequin on standin-1: hidden → None: every texel that faced the training camera was also seen"
+        in outcome.out
+    )
 
 
-def test_the_plan_leaves_out_what_the_scene_cannot_use_and_says_so(finished):
-    (omission,) = read_json(finished.folder / "run.json")["about"]["left_out"]
-    assert (omission["field"], omission["value"]) == ("levels", [16])
-    assert read_json(finished.folder / "avatar" / "avatar.json")["config"]["levels"] == [16]
-    assert f"left out: levels → [16]: {omission['reason']}" in finished.outcome.out
+def run_with_the_profiles_levels(bench, *more):
+    """One step of a fit whose levels nobody has set."""
+    words = bench.run_words("--method.steps", 1, *more)
+    at = words.index("--method.levels")
+    del words[at : at + 3]
+    outcome = bench(*words)
+    (folder,) = bench.folders()
+    levels = read_json(folder / "avatar" / "avatar.json")["config"]["levels"]
+    return outcome, read_json(folder / "run.json")["about"]["left_out"], levels
+
+
+def test_the_plan_leaves_out_what_the_scene_cannot_use_and_says_so(bench):
+    outcome, (omission,), levels = run_with_the_profiles_levels(bench)
+    assert (omission["field"], omission["value"]) == ("levels", levels)
+    assert 0 < len(levels) < len(QUICK.levels)
+    assert f"on standin-1: levels → {levels}: {omission['reason']}" in outcome.out
+
+
+def test_the_plan_leaves_alone_what_somebody_has_set(finished):
+    """The finished run names its levels, of which the second is finer than its images."""
+    assert read_json(finished.folder / "run.json")["about"]["left_out"] == []
+    assert read_json(finished.folder / "avatar" / "avatar.json")["config"]["levels"] == [16, 256]
 
 
 @pytest.mark.parametrize("kept", ["levels", "all"])
 def test_keep_holds_the_plan_back(bench, kept):
-    outcome = bench.run("--keep", kept, "--method.steps", 1)
-    (folder,) = bench.folders()
-    assert read_json(folder / "run.json")["about"]["left_out"] == []
-    assert read_json(folder / "avatar" / "avatar.json")["config"]["levels"] == [16, 256]
+    outcome, left_out, levels = run_with_the_profiles_levels(bench, "--keep", kept)
+    assert left_out == []
+    assert levels == list(QUICK.levels)
     assert f"keep={kept}" in outcome.out
