@@ -86,11 +86,11 @@ def _names(grids: Sequence[Mapping[str, Any]]) -> list[str]:
 def kept(ladder: Ladder, rung: Rung, config: Any) -> tuple[str, ...]:
     """Fields that the plan must leave as the rung has them: its own, and those by which rungs of the ladder differ,
     as far as the rung has them at the profile's value (what differs from the profile stays anyway)."""
+    if any(other.keep for other in ladder.rungs):
+        return rung.keep  # a ladder about the plan itself
     own, base = flat(configured(rung, config)), flat(config)
     set_by_any = sorted({name for other in ladder.rungs for name in other.switches})
-    if "all" in rung.keep or any(other.keep for other in ladder.rungs):
-        return rung.keep  # a ladder about the plan itself
-    return (*rung.keep, *(name for name in set_by_any if own[name] == base[name]))
+    return tuple(name for name in set_by_any if own[name] == base[name])
 
 
 def _plain(value: Any) -> str:

@@ -9,6 +9,7 @@ from ihbench.errors import BadInput
 
 
 def check_keep(keep: tuple[str, ...], config: Any) -> None:
+    """Raises `BadInput` for a field that the method's configuration does not have."""
     from ihbench.config_fields import flat
 
     known = list(flat(config))
