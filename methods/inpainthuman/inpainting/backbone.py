@@ -62,14 +62,15 @@ class Backbone:
 
     def token_ids(self, prompts: list[str]) -> Tensor:
         """[B, L] padded to the text encoder's length, or in a small vocabulary to what it was trained on."""
-        words = self.tokenizer(
-            prompts, padding="max_length", truncation=True, max_length=self.max_tokens, return_tensors="pt"
-        )
-        return words.input_ids.to(self.device)
+        return padded_ids(self.tokenizer, prompts, self.max_tokens).to(self.device)
 
     def text(self, prompts: list[str]) -> Tensor:
         """[B, L, D] hidden states of the prompts, with gradients to whatever of the encoder is trained."""
-        return self.text_encoder(self.token_ids(prompts)).last_hidden_state
+        return self.text_of(self.token_ids(prompts))
+
+    def text_of(self, ids: Tensor) -> Tensor:
+        """`text` of prompts that are token ids already."""
+        return self.text_encoder(ids).last_hidden_state
 
     def condition(
         self,
@@ -116,6 +117,12 @@ class Backbone:
         """[B] signal-to-noise ratio at timesteps."""
         kept = self.scheduler.alphas_cumprod.to(timesteps.device)[timesteps]
         return kept / (1 - kept)
+
+
+def padded_ids(tokenizer: Any, prompts: list[str], length: int) -> Tensor:
+    """[B, length] token ids, cut or padded."""
+    words = tokenizer(prompts, padding="max_length", truncation=True, max_length=length, return_tensors="pt")
+    return words.input_ids
 
 
 def shrink_mask(mask: Tensor, latents: Tensor) -> Tensor:

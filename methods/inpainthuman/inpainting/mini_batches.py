@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from ihbench.methods.inpainthuman.inpainting.backbone import padded_ids
 from ihbench.methods.inpainthuman.inpainting.crop_album import Page
 from ihbench.methods.inpainthuman.inpainting.mini_model import SIZE
 from ihbench.methods.inpainthuman.inpainting.mini_training import MiniTraining
@@ -59,26 +61,37 @@ class Crops:
 
 @dataclass(frozen=True)
 class MiniBatch:
-    """One step's crops, occluders, noise and words."""
+    """One step's crops, occluders, words, and the seed of its noise, which is drawn where it is used."""
 
     images: Tensor  # [B, S, W, 3] uint8
     person: Tensor  # [B, S, W] bool
     hidden: Tensor  # [B, S, W] bool
     labels: Tensor  # [B, S, W] uint8
-    noise: Tensor  # [B, C, h, w]
     timesteps: Tensor  # [B]
     traits: Tensor  # [B, T]
     told: Tensor  # [B] bool: the traits speak in the place of words
-    prompts: list[str]
+    ids: Tensor  # [B, L] the prompts
+    noise_seed: int
     use_parts: bool
+
+    def to(self, device: torch.device) -> MiniBatch:
+        return self._each(lambda tensor: tensor.to(device, non_blocking=True))
+
+    def pin_memory(self) -> MiniBatch:
+        """Called by torch's loader: a GPU copies pinned memory while it computes."""
+        return self._each(Tensor.pin_memory)
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> MiniBatch:
+        tensors = {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
+        return replace(self, **{name: change(tensor) for name, tensor in tensors.items()})
 
 
 class Batches(Dataset[MiniBatch]):
     """`batches[step]`."""
 
-    def __init__(self, config: MiniTraining, crops: Crops, channels: int, block: int, timesteps: int):
-        self.config, self.crops = config, crops
-        self.channels, self.block, self.timesteps = channels, block, timesteps
+    def __init__(self, config: MiniTraining, crops: Crops, timesteps: int, tokenizer: Any, max_tokens: int):
+        self.config, self.crops, self.timesteps = config, crops, timesteps
+        self.tokenizer, self.max_tokens = tokenizer, max_tokens
 
     def __getitem__(self, step: int) -> MiniBatch:
         config = self.config
@@ -86,17 +99,15 @@ class Batches(Dataset[MiniBatch]):
         width, rows = self.crops.draw(rng, config.batch)
         images, person, labels = self.crops.images(width, rows)
         hidden = np.stack([random_mask(rng, silhouette) for silhouette in person])
-        generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-        shape = (len(rows), self.channels, SIZE // self.block, width // self.block)
         use_parts = bool(rng.random() < config.control)
         prompts, told = self.words(rng, rows[:, 2])
         return MiniBatch(
             *(torch.from_numpy(array) for array in (images, person, hidden, labels)),
-            noise=torch.randn(shape, generator=generator),
-            timesteps=torch.randint(0, self.timesteps, (len(rows),), generator=generator),
+            timesteps=torch.from_numpy(rng.integers(0, self.timesteps, len(rows))),
             traits=torch.from_numpy(self.crops.traits[rows[:, 2]]),
             told=torch.tensor(told),
-            prompts=prompts,
+            ids=padded_ids(self.tokenizer, prompts, self.max_tokens),
+            noise_seed=int(rng.integers(2**62)),
             use_parts=use_parts,
         )
 
@@ -117,14 +128,15 @@ class Batches(Dataset[MiniBatch]):
                 prompts.append(PERSON)
         return prompts, told
 
-    def stream(self, first: int, last: int, workers: int) -> Iterator[MiniBatch]:
-        """Batches of steps `first` to `last` - 1, made by worker processes ahead of their time."""
+    def stream(self, first: int, last: int, workers: int, pinned: bool = False) -> Iterator[MiniBatch]:
+        """Batches of steps `first` to `last` - 1, made by workers ahead of their time; `pinned` for a GPU."""
         return iter(
             DataLoader(
                 self,
                 batch_size=None,
                 sampler=range(first, last),
                 num_workers=workers,
+                pin_memory=pinned,
                 prefetch_factor=4 if workers else None,
             )
         )

@@ -27,7 +27,7 @@ def save_mini(backbone: Backbone, folder: Path) -> None:
         original = {key: value.detach().clone() for key, value in part.state_dict().items()}
         with quiet_libraries():  # parts that like float32 complain of being rounded
             part.to(kind).save_pretrained(folder / name, safe_serialization=True)
-        part.to(torch.float32)
+            part.to(torch.float32)
         part.load_state_dict(original)
     backbone.tokenizer.save_pretrained(folder / "tokenizer")
     backbone.scheduler.save_pretrained(folder / "scheduler")

@@ -80,10 +80,10 @@ class MiniTrainer:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed + 1)
             self.tokens = TraitTokens(people.N_TRAITS)
-        codec, scheduler = self.backbone.codec, self.backbone.scheduler
-        self.batches = Batches(config, crops, codec.channels, codec.block, scheduler.config.num_train_timesteps)
+        timesteps = self.backbone.scheduler.config.num_train_timesteps
+        self.batches = Batches(config, crops, timesteps, self.backbone.tokenizer, self.backbone.max_tokens)
         self.modules = {name: getattr(self.backbone, name) for name in TRAINED} | {"tokens": self.tokens}
-        for module in (*self.modules.values(), codec):
+        for module in (*self.modules.values(), self.backbone.codec):
             module.to(self.device)
         if self.device.type == "cuda":  # convolutions are faster so there, and slower on the CPU
             for name in ("unet", "controlnet"):
@@ -134,7 +134,8 @@ class MiniTrainer:
         losses: list[float] = []
         with self.progress.task("training mini", config.steps) as task:
             task.advance(self.step)
-            for batch in self.batches.stream(self.step, config.steps, self.workers):
+            pinned = self.device.type == "cuda"
+            for batch in self.batches.stream(self.step, config.steps, self.workers, pinned):
                 losses.append(self._one_step(batch))
                 self.step += 1
                 task.advance()
@@ -173,12 +174,15 @@ class MiniTrainer:
     def loss(self, batch: MiniBatch) -> Tensor:
         """Weighted error of the clean latents over hidden blocks. SNR weights are clipped to [1, 5]."""
         backbone, device = self.backbone, self.device
-        pixels = batch.images.to(device).movedim(-1, 1).float() / 127.5 - 1
-        person, hidden = (mask.to(device)[:, None].float() for mask in (batch.person, batch.hidden))
-        noise, timesteps = batch.noise.to(device), batch.timesteps.to(device)
+        batch = batch.to(device)
+        pixels = batch.images.movedim(-1, 1).float() / 127.5 - 1
+        person, hidden = (mask[:, None].float() for mask in (batch.person, batch.hidden))
+        timesteps = batch.timesteps
         latents = backbone.codec.encode(pixels)
+        generator = torch.Generator(device).manual_seed(batch.noise_seed)
+        noise = torch.randn(latents.shape, generator=generator, device=device)
         noisy = backbone.scheduler.add_noise(latents, noise, timesteps)
-        parts = self.colours[batch.labels.to(device).long()].movedim(-1, 1) if batch.use_parts else None
+        parts = self.colours[batch.labels.long()].movedim(-1, 1) if batch.use_parts else None
         condition = backbone.condition(pixels, hidden, person)
         with torch.autocast(device.type, torch.bfloat16, enabled=self.config.precision == "bfloat16"):
             predicted = backbone.predict(noisy, timesteps, condition, self._text(batch), parts).float()
@@ -190,10 +194,9 @@ class MiniTrainer:
         return (per_sample * backbone.snr(timesteps).clamp(1, 5)).mean()
 
     def _text(self, batch: MiniBatch) -> Tensor:
-        self._traits = self.tokens(batch.traits.to(self.device))
-        self._told = batch.told.to(self.device)
+        self._traits, self._told = self.tokens(batch.traits), batch.told
         try:
-            return self.backbone.text(batch.prompts)
+            return self.backbone.text_of(batch.ids)
         finally:
             self._traits = None
 
