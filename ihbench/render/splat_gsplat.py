@@ -5,9 +5,9 @@ that the footprint is the one of the other back ends.
 
 One difference remains and cannot be switched off: its kernel ends a pixel *before* the splat that would bring the
 transmittance to 1e-4 or less. Such a pixel shows up to 1e-4 / (1 - ALPHA_MAX) = 0.1 of the background. On a body-like
-scene of 5000 Gaussians, with that rule put into the twin, the largest error was 0.035 and the mean 6e-5. Measured
-with gsplat 1.5.3 on an H200 (`ihbench kernels splat`, 5000 to 200,000 Gaussians): the largest error of a window of 64²
-pixels 0.03 to 0.08, of the gradient's norm 3 to 4 %; 200,000 Gaussians on 512² pixels 2.4 ms forward and 1.3 ms
+scene of 5000 Gaussians, with that rule put into the twin, the largest error was 0.035 and the mean 6e-5. With gsplat
+1.5.3 on an H200 (`ihbench kernels splat`, 5000 to 200,000 Gaussians) the largest error in a window of 64² pixels was
+0.03 to 0.08, that of the gradient's norm 3 to 4 %; 200,000 Gaussians on 512² pixels took 2.4 ms forward and 1.3 ms
 backward, numba on one thread of that machine 71 and 103 ms.
 """
 

@@ -18,6 +18,8 @@ from ihbench.weights import FILES, locate
 
 STATIC_DEG = 5.0  # below this joint motion nothing depends on the pose
 NOTHING_HIDDEN = 0.002  # share of the texels that no frame shows although one faces them; fewer are specks
+PART_TURN = 0.05  # share of the texels that never face the camera, above which the person turns only in part
+GLANCING = 0.5  # cosine; a person who turns in part shows what lies beside the unseen side at less than this
 FINEST_LEVEL = 3.0  # a level whose texels are this many times finer than the pixels cannot be told apart by them
 POINTS_A_PIXEL = 2.0  # along a side; more Gaussians than that draw the same picture
 LEAST_TEXELS = 64
@@ -165,7 +167,19 @@ def leave_out(config: InpaintHumanConfig, scene: SceneMeasure) -> list[Omission]
     if inpaint.on and everything_seen and inpaint.context == "seen" and not inpaint.turntable:
         reason = f"of the surface {scene.hidden_texels:.1%} is hidden whenever it faces the camera: nothing to paint"
         found.append(Omission("inpaint.on", False, reason, {"fit/stage2": 1.0, "fit/stage3": 1.0}))
+    elif _paints_glancing(config) and scene.never_seen_texels > PART_TURN:
+        reason = (
+            f"{scene.never_seen_texels:.0%} of the surface never faces the camera: what is beside it is seen edge-on "
+            "and few pixels would say what it looks like from the front"
+        )
+        found.append(Omission("inpaint.facing", GLANCING, reason))
     return found
+
+
+def _paints_glancing(config: InpaintHumanConfig) -> bool:
+    inpaint = config.inpaint
+    around = inpaint.turntable > 0  # its views show from the front what the frames show edge-on
+    return inpaint.on and inpaint.context == "seen" and not around and inpaint.facing < GLANCING
 
 
 def _both_fits(share: float) -> dict[str, float]:

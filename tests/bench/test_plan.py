@@ -196,6 +196,17 @@ def test_nothing_is_painted_where_every_frame_shows_all(moving):
         assert not [o for o in leave_out(config, seen) if o.field == "inpaint.on"]
 
 
+def test_glancing_surface_is_not_painted_where_the_person_turns_in_part(moving):
+    turned, part = (replace(moving, hidden_texels=0.05, never_seen_texels=share) for share in (0.015, 0.15))
+    (omission,) = [o for o in leave_out(QUICK, part) if o.field == "inpaint.facing"]
+    assert 0 < omission.value < 1
+    assert "15%" in omission.reason
+    assert not [o for o in leave_out(QUICK, turned) if o.field == "inpaint.facing"]
+    for needless in ({"turntable": 4}, {"context": "frame"}, {"on": False}, {"facing": 0.7}):
+        config = replace(QUICK, inpaint=replace(QUICK.inpaint, **needless))
+        assert not [o for o in leave_out(config, part) if o.field == "inpaint.facing"], needless
+
+
 def test_omissions_name_fields_of_the_configuration(moving):
     for o in leave_out(QUICK, replace(moving, motion_deg=0.0, pixel_mm=40.0, hidden_texels=0.0)):
         assert o.value != flat(QUICK)[o.field]
