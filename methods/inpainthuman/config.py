@@ -163,23 +163,18 @@ def leave_out(config: InpaintHumanConfig, scene: SceneMeasure) -> list[Omission]
         share = POINTS_SHARE * (1 - (texels / config.texels) ** 2)
         found.append(Omission("texels", texels, reason, _both_fits(share)))
     inpaint = config.inpaint
-    everything_seen = scene.hidden_texels <= NOTHING_HIDDEN
-    if inpaint.on and everything_seen and inpaint.context == "seen" and not inpaint.turntable:
+    if not inpaint.on or inpaint.context != "seen" or inpaint.turntable:  # a turntable shows all from the front
+        return found
+    if scene.hidden_texels <= NOTHING_HIDDEN:
         reason = f"of the surface {scene.hidden_texels:.1%} is hidden whenever it faces the camera: nothing to paint"
         found.append(Omission("inpaint.on", False, reason, {"fit/stage2": 1.0, "fit/stage3": 1.0}))
-    elif _paints_glancing(config) and scene.never_seen_texels > PART_TURN:
+    elif inpaint.facing < GLANCING and scene.never_seen_texels > PART_TURN:
         reason = (
             f"{scene.never_seen_texels:.0%} of the surface never faces the camera: what is beside it is seen edge-on "
             "and few pixels would say what it looks like from the front"
         )
         found.append(Omission("inpaint.facing", GLANCING, reason))
     return found
-
-
-def _paints_glancing(config: InpaintHumanConfig) -> bool:
-    inpaint = config.inpaint
-    around = inpaint.turntable > 0  # its views show from the front what the frames show edge-on
-    return inpaint.on and inpaint.context == "seen" and not around and inpaint.facing < GLANCING
 
 
 def _both_fits(share: float) -> dict[str, float]:

@@ -85,8 +85,8 @@ class InpaintConfig:
     painter alone (the paper). With context "seen" only."""
     facing: float = 0.0
     """Only surface is painted that faces some training view, hidden, by at least this cosine; what all views would
-    see at a glancing angle keeps stage 1's colours. 0: all of it (the paper). 0.5 is better where the person hardly
-    turns, and worse where stage 1 leaves holes. With context "seen"."""
+    see at a glancing angle keeps stage 1's colours. 0: all of it (the paper). The plan takes 0.5 where the person
+    turns only in part; where they turn fully that is worse. With context "seen"."""
     key_views: int = 40
     """Frames painted at most, chosen to see all of the surface that needs it; 0 for every frame that sees some."""
     turntable: int = 0
