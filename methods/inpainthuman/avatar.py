@@ -149,9 +149,10 @@ class GaussianAvatar(nn.Module):
         return torch.from_numpy(self.body.joint_transforms(own)[:, :3].astype(np.float32)).to(self.device)
 
     def unhidden(self, camera: Camera, body_pose: BodyPose) -> NDArray[np.int64]:
-        """Numbers of the points that the posed body itself does not hide from this camera, with slack for offsets.
+        """Numbers of the points that the posed body itself does not hide from this camera, with slack for offsets:
+        those that a step of fitting draws.
 
-        With opacity 1 whatever lies behind the first surface contributes nothing, so it need not be decoded.
+        With opacity 1 whatever lies behind the first surface contributes next to nothing, so it need not be decoded.
         """
         if not self.config.cull:
             return np.arange(len(self))
@@ -183,10 +184,13 @@ class GaussianAvatar(nn.Module):
     def render(
         self, camera: Camera, body_pose: BodyPose, background: tuple[float, float, float] = (1.0, 1.0, 1.0)
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """rgb [H, W, 3] on `background` and alpha [H, W]; see `ihbench.scene.Avatar`."""
-        points = torch.from_numpy(self.unhidden(camera, body_pose)).to(self.device)
+        """rgb [H, W, 3] on `background` and alpha [H, W]; see `ihbench.scene.Avatar`.
+
+        Draws every point: where the first surface has a gap, what is behind it is nearer to the truth than the
+        background.
+        """
         with torch.no_grad():
-            rgb, alpha = render_gaussians(*self.gaussians(body_pose, points), camera, background)
+            rgb, alpha = render_gaussians(*self.gaussians(body_pose), camera, background)
         return rgb.clamp(0, 1).cpu().numpy(), alpha.cpu().numpy()
 
     def save(self, folder: Path) -> None:

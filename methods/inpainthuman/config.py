@@ -89,7 +89,8 @@ class InpaintHumanConfig:
     clip_gradient: float = 1.0
     """Bound on the norm of each group's gradient."""
     cull: bool = True
-    """Leave out Gaussians that the posed body hides before they are decoded. Changes time, hardly the image."""
+    """While fitting, leave out Gaussians that the posed body hides, before they are decoded. Changes the time of a
+    step, hardly its image. Pictures are drawn with all of them."""
     paper_strict: bool = False
     """Follow the paper's text where it differs from sensible defaults: no background term, no regularisers."""
     inpaint: InpaintConfig = field(default_factory=lambda: QUICK_INPAINT)
@@ -163,8 +164,8 @@ def leave_out(config: InpaintHumanConfig, scene: SceneMeasure) -> list[Omission]
         share = POINTS_SHARE * (1 - (texels / config.texels) ** 2)
         found.append(Omission("texels", texels, reason, _both_fits(share)))
     inpaint = config.inpaint
-    if not inpaint.on or inpaint.context != "seen" or inpaint.turntable:  # a turntable shows all from the front
-        return found
+    if not inpaint.on or inpaint.always or inpaint.context != "seen" or inpaint.turntable:
+        return found  # a turntable shows all from the front
     if scene.hidden_texels <= NOTHING_HIDDEN:
         reason = f"of the surface {scene.hidden_texels:.1%} is hidden whenever it faces the camera: nothing to paint"
         found.append(Omission("inpaint.on", False, reason, {"fit/stage2": 1.0, "fit/stage3": 1.0}))

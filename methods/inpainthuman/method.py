@@ -49,7 +49,7 @@ class InpaintHuman:
 
             with ledger.stage("fit/stage2"):
                 painted = Stage2(avatar, training, inpaint, seed, ledger).run(progress)
-            if painted:
+            if painted or inpaint.always:
                 with ledger.stage("fit/stage3"):
                     Stage3(avatar, training, painted, seed, ledger).run(progress)
         return avatar

@@ -39,7 +39,7 @@ class Stage2:
         with self.ledger.stage("look"):
             surface = seen_surface(self.training, TEXELS, self.config.facing)
             shown = self._shown(surface)
-        if not shown:
+        if not shown and not self.config.always:
             return self._nothing("no training view hides surface that needs a painter")
         painter, size, square = self._painter()
         finder = self._silhouettes()  # before anything is learned: its weights may be missing
@@ -47,12 +47,14 @@ class Stage2:
         with self.ledger.stage("look"):
             crops = [cut_view(view, k, body, size, square) for k, view in shown.items()]
             crops = [crop for crop in crops if crop.unknown.any()]
-            if not crops:  # what is asked lies outside of every crop
+            if not crops and not self.config.always:  # what is asked lies outside of every crop
                 return self._nothing("what is hidden lies outside of every crop of the body")
             frames = [cut_view(views[k], k, body, size, square) for k in range(len(views))]
             filmed = with_frames(crops, frames)
         if self.config.filler == "diffusion":
             painter.learn(frames, progress)
+        if not crops:
+            return self._nothing("nothing needed painting; personalised and refined as asked")
         with self.ledger.stage("inpaint"):
             # the simple painters take their colours from whatever frame shows them
             given = crops if self.config.filler == "diffusion" else filmed

@@ -209,6 +209,7 @@ def test_a_rung_can_keep_what_the_plan_would_leave_out(bench):
         cells = ablate_command._cells(chosen, ladder, Progress.silent())
     assert [rung for rung, _ in cells] == ["everything", "planned"] * 2
     assert [cell.request.keep for _, cell in cells] == [("all",), ()] * 2
+    assert [cell.request.config.cull for _, cell in cells] == [False, True] * 2
     assert [cell.request.seed for _, cell in cells] == [0, 0, 1, 1]
     assert all(cell.request.share and cell.after is None for _, cell in cells)
 

@@ -191,7 +191,7 @@ def test_nothing_is_painted_where_every_frame_shows_all(moving):
     assert omission.value is False
     assert "0.1%" in omission.reason
     assert not [o for o in leave_out(QUICK, replace(moving, hidden_texels=0.02)) if o.field == "inpaint.on"]
-    for needed in ({"turntable": 4}, {"context": "frame"}, {"on": False}):
+    for needed in ({"turntable": 4}, {"context": "frame"}, {"on": False}, {"always": True}):
         config = replace(QUICK, inpaint=replace(QUICK.inpaint, **needed))
         assert not [o for o in leave_out(config, seen) if o.field == "inpaint.on"]
 
@@ -202,7 +202,7 @@ def test_glancing_surface_is_not_painted_where_the_person_turns_in_part(moving):
     assert 0 < omission.value < 1
     assert "15%" in omission.reason
     assert not [o for o in leave_out(QUICK, turned) if o.field == "inpaint.facing"]
-    for needless in ({"turntable": 4}, {"context": "frame"}, {"on": False}, {"facing": 0.7}):
+    for needless in ({"turntable": 4}, {"context": "frame"}, {"on": False}, {"always": True}, {"facing": 0.7}):
         config = replace(QUICK, inpaint=replace(QUICK.inpaint, **needless))
         assert not [o for o in leave_out(config, part) if o.field == "inpaint.facing"], needless
 

@@ -29,6 +29,9 @@ class Settled:
 class InpaintConfig:
     on: bool = True
     """Stages 2 and 3. Off: stage 1 alone."""
+    always: bool = False
+    """Personalise the painter and refine also where nothing needs painting, as the paper's text has it. Only good for
+    measuring what leaving them out saves."""
     filler: Filler = "diffusion"
     """What paints hidden pixels: the paper's diffusion model, or one of the simple fills beside it in tables."""
     backbone: Literal["mini", "sd2"] = "mini"
