@@ -187,7 +187,8 @@ class _Run(RecordedRun):
         with scene.train.preload() as preloading:  # beside planning and compiling
             with self.ledger.stage("plan"):
                 measure = measure_scene(self.capture, protocol, self.body)
-                config, left_out = _planned(request, measure)
+                config, left_out, withheld = _planned(request, measure)
+                hidden_share = scene.hiding.hidden_share()
             with self.ledger.stage("compile"):
                 method: Method = registry.load("method", request.method)(config)
                 machine.warm_up(request.device)
@@ -197,13 +198,14 @@ class _Run(RecordedRun):
         with self.ledger.stage("visibility"):
             self.scorer = Scorer.build(scene, self.body)
         self.describe(
-            changed=_changed(request),
+            changed=_changed(request, withheld),
             left_out=[asdict(o) for o in left_out],
             measure=asdict(measure),
-            hidden_share=scene.hiding.hidden_share(),
+            hidden_share=hidden_share,
         )
         if request.share:
-            self._take_shared_states()
+            with self.ledger.stage("share"):
+                self._take_shared_states()
         self.folder.set_status("running", ledger=self.ledger)
         training = TrainingSet(scene.train, self.body, protocol.image.background, self.capture.name)
         with self.ledger.stage("fit"):
@@ -245,24 +247,24 @@ class _Run(RecordedRun):
         self.folder.add_curve_point({"step": step, "seconds": seconds, "views": len(chosen), "scores": scores})
 
 
-def _planned(request: RunRequest, measure: SceneMeasure) -> tuple[Any, list[Omission]]:
-    """The configuration without what the scene does not need, and what that was. A switch that differs from the
-    profile was set by somebody, and stays."""
-    left_out = absent_regions(measure, request.protocol.regions)
-    if "all" in request.keep:
-        return request.config, left_out
+def _planned(request: RunRequest, measure: SceneMeasure) -> tuple[Any, list[Omission], list[str]]:
+    """The configuration without what the scene does not need, what that was, and fields that `keep` held back. A
+    switch that differs from the profile was set by somebody, and stays."""
     found = registry.load("config", request.method)
     own, base = flat(request.config), flat(found.PROFILES[request.protocol.profile])
-    free = [name for name in own if name not in request.keep and own[name] == base[name]]
-    proposed = [o for o in found.leave_out(request.config, measure) if o.field in free]
-    return with_fields(request.config, {o.field: o.value for o in proposed}), proposed + left_out
+    proposed = [o for o in found.leave_out(request.config, measure) if own[o.field] == base[o.field]]
+    withheld = [o.field for o in proposed if "all" in request.keep or o.field in request.keep]
+    taken = [o for o in proposed if o.field not in withheld]
+    config = with_fields(request.config, {o.field: o.value for o in taken})
+    return config, taken + absent_regions(measure, request.protocol.regions), withheld
 
 
-def _changed(request: RunRequest) -> list[str]:
-    """Switches that differ from the profile, and the protocol's occlusion if it was replaced, for table rows."""
+def _changed(request: RunRequest, withheld: list[str]) -> list[str]:
+    """What sets the run apart from the profile, for table rows: switches, and what the plan was not let to leave out
+    (a `keep` that changed nothing is no difference)."""
     base = flat(registry.load("config", request.method).PROFILES[request.protocol.profile])
     changed = [f"{name}={value}" for name, value in flat(request.config).items() if value != base[name]]
-    return [*changed, f"keep={','.join(request.keep)}"] if request.keep else changed
+    return [*changed, f"keep={','.join(withheld)}"] if withheld else changed
 
 
 def _source_digest(package: Path) -> str:

@@ -89,7 +89,8 @@ def test_the_plan_changes_only_what_nobody_has_set(moving, keep, texels):
     far = replace(moving, pixel_mm=1000.0)
     own = replace(QUICK, levels=(128, 256))
     request = RunRequest(load_protocol("zju_occ"), "inpainthuman", own, keep=keep)
-    config, left_out = _planned(request, far)
+    config, left_out, withheld = _planned(request, far)
+    assert withheld == list(keep)
     assert config.levels == (128, 256)
     assert config.texels == (LEAST_TEXELS if texels == 32 else texels)
     assert "levels" not in [o.field for o in left_out]

@@ -270,4 +270,4 @@ def test_keep_holds_the_plan_back(bench, kept):
     outcome, left_out, levels = run_with_the_profiles_levels(bench, "--keep", kept)
     assert left_out == []
     assert levels == list(QUICK.levels)
-    assert f"keep={kept}" in outcome.out
+    assert "keep=levels" in outcome.out
