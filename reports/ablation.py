@@ -139,7 +139,7 @@ def _comparisons(
         row: dict[str, Any] = {"what": comparison.what, "without": comparison.without, "with": comparison.having}
         row["scores"] = {i: _paired(per_scene(after, i), per_scene(before, i)) for i in columns}
         alike = one_clock([*before, *after])
-        row["fit_seconds"] = _paired(_seconds(after), _seconds(before)) if alike else None
+        row["fit_seconds"] = _more_seconds(after, before) if alike else None
         found.append(row)
     impossible = []
     for i in columns:
@@ -159,8 +159,7 @@ def _comparisons(
     for row in found:
         n = max(pair["n"] for pair in row["scores"].values() if pair)
         cells = [_difference(row["scores"][i], metric_of(i)) for i in columns]
-        seconds = row["fit_seconds"]
-        cells.append("—" if seconds is None else f"{seconds['mean']:+.0f}")
+        cells.append(_seconds_text(row["fit_seconds"]))
         lines.append(f"| {row['what']} | {n} | " + " | ".join(cells) + " |")
     if impossible:
         lines += [
@@ -210,6 +209,25 @@ def _difference(pair: dict[str, Any] | None, metric: Metric) -> str:
     mean, low, high = (pair[name] * metric.scale for name in ("mean", "low", "high"))
     mark = "*" if pair["p_adjusted"] < ALPHA else ""
     return f"{mean:+.{d}f}{mark} [{low:+.{d}f}, {high:+.{d}f}]"
+
+
+def _more_seconds(after: Sequence[RunResult], before: Sequence[RunResult]) -> dict[str, Any] | None:
+    """As `_paired`, with the share that the difference is of the seconds before; None where these are 0."""
+    without = _seconds(before)
+    pair: dict[str, Any] | None = _paired(_seconds(after), without)
+    if pair is None:
+        return None
+    mean = math.fsum(without.values()) / len(without)
+    return pair | {"share": pair["mean"] / mean if mean > 0 else None}
+
+
+def _seconds_text(pair: dict[str, Any] | None) -> str:
+    """Seconds more (or fewer), their interval, and the share."""
+    if pair is None:
+        return "—"
+    interval = "" if pair["n"] == 1 else f" [{pair['low']:+.0f}, {pair['high']:+.0f}]"
+    share = "" if pair["share"] is None else f", {pair['share']:+.0%}"
+    return f"{pair['mean']:+.0f}{interval}{share}"
 
 
 def _severities(ladder: Ladder, tables: Sequence[Mapping[str, Any]]) -> list[str]:

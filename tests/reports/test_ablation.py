@@ -65,6 +65,19 @@ def test_one_scene_has_a_difference_without_interval(tmp_path):
     assert table["comparisons"][0]["fit_seconds"]["mean"] == 0
 
 
+def test_seconds_are_compared_with_an_interval_and_as_a_share(tmp_path):
+    low = [made_up(tmp_path, s, psnr=20, fit=200 + k) for k, s in enumerate(SCENES)]
+    high = [made_up(tmp_path, s, psnr=20, fit=100 + 2 * k, seed=0) for k, s in enumerate(SCENES)]
+    text, table = told({"low": low, "high": high})
+    seconds = table["comparisons"][0]["fit_seconds"]
+    assert seconds["mean"] == pytest.approx(-97.5)
+    assert seconds["share"] == pytest.approx(-97.5 / 202.5)
+    assert seconds["low"] < -97.5 < seconds["high"] < -90
+    assert f"| -98 [{seconds['low']:+.0f}, {seconds['high']:+.0f}], -48% |" in text
+    nothing = {"low": [made_up(tmp_path, "a", psnr=20, fit=0)], "high": [made_up(tmp_path, "a", psnr=20, fit=5)]}
+    assert "| +5 |" in told(nothing)[0]
+
+
 def test_seconds_of_two_clocks_are_not_compared(tmp_path):
     other = {"cpu": "a slower one", "load_average": [40.0, 1.0, 1.0]}
     text, table = told({"low": rung(tmp_path, 20, fit=100), "high": rung(tmp_path, 22, fit=400, machine=other)})
