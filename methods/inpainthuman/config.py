@@ -86,6 +86,8 @@ class InpaintHumanConfig:
     """AdamW step size of the residual encoder (1e-4 in the paper)."""
     lr_final: float = 0.05
     """Step sizes fall along a cosine to this share of their start."""
+    crop: bool = True
+    """While fitting, draw only the window around the body. Off: the whole image. Changes the time of a step only."""
     clip_gradient: float = 1.0
     """Bound on the norm of each group's gradient."""
     cull: bool = True
@@ -164,11 +166,11 @@ def leave_out(config: InpaintHumanConfig, scene: SceneMeasure) -> list[Omission]
         share = POINTS_SHARE * (1 - (texels / config.texels) ** 2)
         found.append(Omission("texels", texels, reason, _both_fits(share)))
     inpaint = config.inpaint
-    if not inpaint.on or inpaint.always or inpaint.context != "seen" or inpaint.turntable:
+    if not inpaint.on or inpaint.filler == "none" or inpaint.always or inpaint.context != "seen" or inpaint.turntable:
         return found  # a turntable shows all from the front
     if scene.hidden_texels <= NOTHING_HIDDEN:
         reason = f"of the surface {scene.hidden_texels:.1%} is hidden whenever it faces the camera: nothing to paint"
-        found.append(Omission("inpaint.on", False, reason, {"fit/stage2": 1.0, "fit/stage3": 1.0}))
+        found.append(Omission("inpaint.filler", "none", reason, {"fit/stage2": 1.0}))
     elif inpaint.facing < GLANCING and scene.never_seen_texels > PART_TURN:
         reason = (
             f"{scene.never_seen_texels:.0%} of the surface never faces the camera: what is beside it is seen edge-on "

@@ -8,8 +8,9 @@ from ihbench.ablation import Comparison, Ladder, Rung
 
 ONE_LEVEL: dict[str, Any] = {"levels": (128,)}  # the paper does not say which single map its baseline has
 NO_PAINTER: dict[str, Any] = {"inpaint.on": False}
+NOTHING_PAINTED: dict[str, Any] = {"inpaint.filler": "none"}  # stage 3 takes further steps all the same
 # what is left out everywhere, besides what the plan leaves out of a scene
-EVERYTHING: dict[str, Any] = {"cull": False, "inpaint.key_views": 0, "inpaint.always": True}
+EVERYTHING: dict[str, Any] = {"cull": False, "crop": False, "inpaint.key_views": 0, "inpaint.always": True}
 NEITHER: dict[str, Any] = {"inpaint.ti": False, "inpaint.sg": False}
 
 
@@ -35,6 +36,7 @@ LADDERS = {
         (
             Rung("one level", ONE_LEVEL | NO_PAINTER, ROWS[0]),
             Rung("MS", NO_PAINTER, ROWS[1]),
+            Rung("MS, refined", NOTHING_PAINTED),
             Rung("one level, diffusion", ONE_LEVEL | NEITHER, ROWS[0]),
             Rung("MS, diffusion", NEITHER, ROWS[1]),
             Rung("MS + TI", {"inpaint.sg": False}, ROWS[2]),
@@ -43,6 +45,7 @@ LADDERS = {
         (
             Comparison("multi-scale maps", "one level", "MS"),
             Comparison("multi-scale maps, with diffusion", "one level, diffusion", "MS, diffusion"),
+            Comparison("stage 3 without paintings", "MS", "MS, refined"),
             Comparison("diffusion without a word", "MS", "MS, diffusion"),
             Comparison("the word V* (TI)", "MS, diffusion", "MS + TI"),
             Comparison("diffusion and the word", "MS", "MS + TI"),
@@ -53,7 +56,7 @@ LADDERS = {
         "numbers stand beside both.",
     ),
     "plan": Ladder(
-        "everything, hidden Gaussians and needless key views too, against what the plan leaves for each scene",
+        "everything (hidden Gaussians, whole images, needless key views), against what the plan leaves for a scene",
         (Rung("everything", EVERYTHING, keep=("all",)), Rung("planned")),
         (Comparison("leaving out what the scene does not need", "everything", "planned"),),
     ),
@@ -92,7 +95,7 @@ LADDERS = {
     "painter": Ladder(
         "what paints hidden surface",
         (
-            Rung("nothing", NO_PAINTER),
+            Rung("nothing", NOTHING_PAINTED),
             *(Rung(name, {"inpaint.filler": name}) for name in ("push-pull", "mirror", "temporal")),
             Rung("diffusion", {}),
         ),

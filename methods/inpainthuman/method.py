@@ -34,7 +34,7 @@ class InpaintHuman:
                 from ihbench.methods.inpainthuman.inpainting.diffusion_inpainter import check_backbone
 
                 check_backbone(inpaint)
-            if inpaint.on and inpaint.silhouette == "sam":
+            if inpaint.on and inpaint.filler != "none" and inpaint.silhouette == "sam":
                 from ihbench.methods.inpainthuman.inpainting.complete_silhouette import check_sam
 
                 check_sam(inpaint.sam_weights)
@@ -43,15 +43,17 @@ class InpaintHuman:
         with ledger.stage("fit/stage1"):
             Stage1(avatar, training, seed, ledger).run(progress)
         if inpaint.on:
-            # imported here: a run without inpainting must not pay for it
-            from ihbench.methods.inpainthuman.stage2 import Stage2
+            painted = []
+            if inpaint.filler != "none":
+                # imported here: a run without inpainting must not pay for it
+                from ihbench.methods.inpainthuman.stage2 import Stage2
+
+                with ledger.stage("fit/stage2"):
+                    painted = Stage2(avatar, training, inpaint, seed, ledger).run(progress)
             from ihbench.methods.inpainthuman.stage3 import Stage3
 
-            with ledger.stage("fit/stage2"):
-                painted = Stage2(avatar, training, inpaint, seed, ledger).run(progress)
-            if painted or inpaint.always:
-                with ledger.stage("fit/stage3"):
-                    Stage3(avatar, training, painted, seed, ledger).run(progress)
+            with ledger.stage("fit/stage3"):
+                Stage3(avatar, training, painted, seed, ledger).run(progress)
         return avatar
 
     def load(self, folder: Path, body: Body, device: str = "cpu") -> GaussianAvatar:

@@ -37,7 +37,7 @@ class Target:
 def prepare_target(avatar: GaussianAvatar, view: TrainView) -> Target:
     """Cut a training view to the body's window and find the points it can show."""
     vertices = avatar.body.pose(view.body_pose, blend_shapes=False)
-    x0, y0, width, height = body_window(view.camera, vertices)
+    x0, y0, width, height = fitted_window(avatar, view.camera, vertices)
     camera = view.camera.cropped(x0, y0, width, height)
     rows, cols = slice(y0, y0 + height), slice(x0, x0 + width)
     device = avatar.device
@@ -54,6 +54,11 @@ def prepare_target(avatar: GaussianAvatar, view: TrainView) -> Target:
         transforms=avatar.transforms(view.body_pose),
         position_map=avatar.position_map(view.body_pose),
     )
+
+
+def fitted_window(avatar: GaussianAvatar, camera: Camera, vertices: np.ndarray) -> tuple[int, int, int, int]:
+    """x0, y0, width, height in px of what a step draws: `body_window`, or the whole image where that is asked for."""
+    return body_window(camera, vertices) if avatar.config.crop else (0, 0, camera.width, camera.height)
 
 
 def body_window(camera: Camera, vertices: np.ndarray) -> tuple[int, int, int, int]:

@@ -54,7 +54,7 @@ class Stage2:
         if self.config.filler == "diffusion":
             painter.learn(frames, progress)
         if not crops:
-            return self._nothing("nothing needed painting; personalised and refined as asked")
+            return self._nothing("nothing needed painting; personalised as asked")
         with self.ledger.stage("inpaint"):
             # the simple painters take their colours from whatever frame shows them
             given = crops if self.config.filler == "diffusion" else filmed

@@ -24,8 +24,8 @@ from ihbench.methods.inpainthuman.refine_loss import (
 from ihbench.methods.inpainthuman.stage1 import (
     TARGETS_HELD,
     Target,
-    body_window,
     draw,
+    fitted_window,
     initial_loss,
     prepare_target,
 )
@@ -124,7 +124,8 @@ class Stage3(Optimisation):
                     f"painted view {k}: has shape {painted.view.image.shape}, expected {view.image.shape}, the "
                     f"training view's"
                 )
-        x0, y0, width, height = body_window(view.camera, self.avatar.body.pose(view.body_pose, blend_shapes=False))
+        vertices = self.avatar.body.pose(view.body_pose, blend_shapes=False)
+        x0, y0, width, height = fitted_window(self.avatar, view.camera, vertices)
         rows, cols = slice(y0, y0 + height), slice(x0, x0 + width)
         background, device = self.training.background, self.avatar.device
         return RefineTarget(

@@ -79,7 +79,7 @@ def test_what_is_compared_is_kept_from_the_plan():
     assert [kept(ladder, rung, QUICK) for rung in ladder.rungs] == [("inpaint.on", "texels"), ("inpaint.on",)]
     ladder = registry.load("ladder", "inpainthuman")["table2"]
     full = ladder.rungs[-1]
-    assert set(kept(ladder, full, QUICK)) == {"levels", "inpaint.on", "inpaint.ti", "inpaint.sg"}
+    assert set(kept(ladder, full, QUICK)) == {"levels", "inpaint.on", "inpaint.filler", "inpaint.ti", "inpaint.sg"}
     plan = registry.load("ladder", "inpainthuman")["plan"]
     assert [kept(plan, rung, QUICK) for rung in plan.rungs] == [("all",), ()]
 
@@ -210,7 +210,7 @@ def test_a_rung_can_keep_what_the_plan_would_leave_out(bench):
         cells = ablate_command._cells(chosen, ladder, Progress.silent())
     assert [rung for rung, _ in cells] == ["everything", "planned"] * 2
     assert [cell.request.keep for _, cell in cells] == [("all",), ()] * 2
-    assert [cell.request.config.cull for _, cell in cells] == [False, True] * 2
+    assert [(c.request.config.cull, c.request.config.crop) for _, c in cells] == [(False, False), (True, True)] * 2
     assert [cell.request.seed for _, cell in cells] == [0, 0, 1, 1]
     assert all(cell.request.share and cell.after is None for _, cell in cells)
 

@@ -187,13 +187,13 @@ def test_a_far_camera_makes_the_pixels_coarse():
 
 def test_nothing_is_painted_where_every_frame_shows_all(moving):
     seen = replace(moving, hidden_texels=0.001)
-    (omission,) = [o for o in leave_out(QUICK, seen) if o.field == "inpaint.on"]
-    assert omission.value is False
+    (omission,) = [o for o in leave_out(QUICK, seen) if o.field == "inpaint.filler"]
+    assert omission.value == "none"
     assert "0.1%" in omission.reason
-    assert not [o for o in leave_out(QUICK, replace(moving, hidden_texels=0.02)) if o.field == "inpaint.on"]
-    for needed in ({"turntable": 4}, {"context": "frame"}, {"on": False}, {"always": True}):
+    assert not [o for o in leave_out(QUICK, replace(moving, hidden_texels=0.02)) if o.field == "inpaint.filler"]
+    for needed in ({"turntable": 4}, {"context": "frame"}, {"on": False}, {"filler": "none"}, {"always": True}):
         config = replace(QUICK, inpaint=replace(QUICK.inpaint, **needed))
-        assert not [o for o in leave_out(config, seen) if o.field == "inpaint.on"]
+        assert not [o for o in leave_out(config, seen) if o.field == "inpaint.filler"]
 
 
 def test_glancing_surface_is_not_painted_where_the_person_turns_in_part(moving):
@@ -285,7 +285,7 @@ def test_what_an_omission_saves_is_its_share_of_the_stages_of_earlier_runs(tmp_p
     stages = earlier.stages
     assert stages == {"fit/stage1": 15, "fit/stage2": 40, "fit/stage3": 20}
     found = {o.field: o.seconds(stages) for o in leave_out(QUICK, replace(moving, motion_deg=0.0, hidden_texels=0.0))}
-    assert found["inpaint.on"] == 60
+    assert found["inpaint.filler"] == 40
     assert found["pose_residual"] == pytest.approx(RESIDUAL_SHARE * 35)
     assert Omission("hidden", None, "why").seconds(stages) is None
     assert Omission("x", 1, "why", {"fit/stage9": 1.0}).seconds(stages) is None
@@ -294,4 +294,4 @@ def test_what_an_omission_saves_is_its_share_of_the_stages_of_earlier_runs(tmp_p
 def test_a_measure_can_be_made_by_hand():
     """Methods of others build one for their own tests."""
     scene = SceneMeasure(1, 0, 1, 0, 1, 0, 0, motion_deg=0, turn_deg=0, pixel_mm=3, surface_mm=1500, occlusion={})
-    assert [o.field for o in leave_out(QUICK, scene)] == ["pose_residual", "inpaint.on"]
+    assert [o.field for o in leave_out(QUICK, scene)] == ["pose_residual", "inpaint.filler"]

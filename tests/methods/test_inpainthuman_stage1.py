@@ -121,6 +121,10 @@ def test_a_window_shows_what_the_whole_image_shows(views):
         states = target.person + target.background + 0
         assert torch.equal(states[..., 0] == 0, torch.from_numpy(view.mask[rows, cols] == MaskState.UNKNOWN))
         assert target.person.sum() == (view.mask == MaskState.PERSON).sum(), "the window cuts the person"
+        whole = shaken(an_avatar(cull=False, crop=False), 0.05)
+        assert prepare_target(whole, view).image.shape == view.image.shape
+        losses = [loss_of(each, prepare_target(each, view), WHITE).item() for each in (avatar, whole)]
+        assert losses[1] == pytest.approx(losses[0], rel=1e-3)
 
 
 @pytest.mark.parametrize(
