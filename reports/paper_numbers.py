@@ -84,7 +84,7 @@ class Component:
     on: tuple[str, ...] = ()  # switches that must all be on
     several: str = ""  # switch that must hold more than one value
     equal: tuple[tuple[str, str], ...] = ()  # switches that must have one value, and that value
-    unequal: tuple[tuple[str, str], ...] = ()  # switches that must not have one value, and that value
+    off: tuple[str, ...] = ()  # switches that must be off, or unknown to the run
     measured_only: bool = False
 
 
@@ -174,7 +174,7 @@ def _table(name: str, raw: dict[str, Any], source: str, digits: dict[str, dict[s
                 on=tuple(c.get("on", ())),
                 several=c.get("several", ""),
                 equal=tuple(c.get("equal", {}).items()),
-                unequal=tuple(c.get("unequal", {}).items()),
+                off=tuple(c.get("off", ())),
                 measured_only=c.get("measured_only", False),
             )
             for c in raw.get("component", ())

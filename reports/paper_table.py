@@ -381,14 +381,14 @@ def _flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
 
 
 def _one(component: Component, configs: Sequence[Mapping[str, Any]]) -> str:
-    wanted = [*component.on, *(name for name, _ in (*component.equal, *component.unequal))]
+    wanted = [*component.on, *(name for name, _ in component.equal)]
     wanted += [component.several] if component.several else []
     if any(name not in config for config in configs for name in wanted):
         return UNKNOWN
     found = {
         all(bool(config[name]) for name in component.on)
         and all(config[name] == value for name, value in component.equal)
-        and not any(config[name] == value for name, value in component.unequal)
+        and not any(config.get(name) for name in component.off)
         and (not component.several or len(config[component.several]) > 1)
         for config in configs
     }

@@ -30,11 +30,11 @@ class InpaintHuman:
             raise BadInput(f"scene {training.name}: no training view; nothing to fit")
         inpaint = self.config.inpaint
         with ledger.stage("fit/prepare"):
-            if inpaint.uses_diffusion and inpaint.names_something:
+            if self.config.paints and inpaint.uses_diffusion and inpaint.names_something:
                 from ihbench.methods.inpainthuman.inpainting.diffusion_inpainter import check_backbone
 
                 check_backbone(inpaint)
-            if inpaint.on and inpaint.filler != "none" and inpaint.silhouette == "sam":
+            if self.config.paints and inpaint.silhouette == "sam":
                 from ihbench.methods.inpainthuman.inpainting.complete_silhouette import check_sam
 
                 check_sam(inpaint.sam_weights)
@@ -42,16 +42,13 @@ class InpaintHuman:
             avatar = GaussianAvatar(self.config, training.body, betas, seed).to(device)
         with ledger.stage("fit/stage1"):
             Stage1(avatar, training, seed, ledger).run(progress)
-        if inpaint.on:
-            painted = []
-            if inpaint.filler != "none":
-                # imported here: a run without inpainting must not pay for it
-                from ihbench.methods.inpainthuman.stage2 import Stage2
-
-                with ledger.stage("fit/stage2"):
-                    painted = Stage2(avatar, training, inpaint, seed, ledger).run(progress)
+        if self.config.paints:
+            # imported here: a run without inpainting must not pay for it
+            from ihbench.methods.inpainthuman.stage2 import Stage2
             from ihbench.methods.inpainthuman.stage3 import Stage3
 
+            with ledger.stage("fit/stage2"):
+                painted = Stage2(avatar, training, inpaint, seed, ledger).run(progress)
             with ledger.stage("fit/stage3"):
                 Stage3(avatar, training, painted, seed, ledger).run(progress)
         return avatar

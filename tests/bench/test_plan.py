@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,15 @@ from ihbench import plan
 from ihbench.body import texel_table
 from ihbench.config_fields import flat, with_fields
 from ihbench.earlier_runs import earlier_runs
-from ihbench.methods.inpainthuman.config import LEAST_TEXELS, PAPER, QUICK, RESIDUAL_SHARE, leave_out
+from ihbench.methods.inpainthuman import config as method_config
+from ihbench.methods.inpainthuman.config import (
+    LEAST_TEXELS,
+    ONE_FIT_SHARE,
+    PAPER,
+    QUICK,
+    RESIDUAL_SHARE,
+    leave_out,
+)
 from ihbench.plan import (
     TEXELS,
     Omission,
@@ -185,15 +194,17 @@ def test_a_far_camera_makes_the_pixels_coarse():
     assert [o.value for o in leave_out(QUICK, far) if o.field == "levels"] == [(64,)]
 
 
-def test_nothing_is_painted_where_every_frame_shows_all(moving):
+def test_nothing_is_painted_where_every_frame_shows_all(moving, monkeypatch):
     seen = replace(moving, hidden_texels=0.001)
-    (omission,) = [o for o in leave_out(QUICK, seen) if o.field == "inpaint.filler"]
-    assert omission.value == "none"
+    (omission,) = [o for o in leave_out(QUICK, seen) if o.field == "one_fit"]
+    assert omission.value is True
     assert "0.1%" in omission.reason
-    assert not [o for o in leave_out(QUICK, replace(moving, hidden_texels=0.02)) if o.field == "inpaint.filler"]
-    for needed in ({"turntable": 4}, {"context": "frame"}, {"on": False}, {"filler": "none"}, {"always": True}):
+    assert not [o for o in leave_out(QUICK, replace(moving, hidden_texels=0.02)) if o.field == "one_fit"]
+    for needed in ({"turntable": 4}, {"context": "frame"}, {"on": False}, {"always": True}):
         config = replace(QUICK, inpaint=replace(QUICK.inpaint, **needed))
-        assert not [o for o in leave_out(config, seen) if o.field == "inpaint.filler"]
+        assert not [o for o in leave_out(config, seen) if o.field == "one_fit"]
+    monkeypatch.setattr(method_config, "locate", lambda file: Path("trunk"))  # stage 3 has LPIPS, the one fit has not
+    assert not [o for o in leave_out(QUICK, seen) if o.field == "one_fit"]
 
 
 def test_glancing_surface_is_not_painted_where_the_person_turns_in_part(moving):
@@ -285,7 +296,7 @@ def test_what_an_omission_saves_is_its_share_of_the_stages_of_earlier_runs(tmp_p
     stages = earlier.stages
     assert stages == {"fit/stage1": 15, "fit/stage2": 40, "fit/stage3": 20}
     found = {o.field: o.seconds(stages) for o in leave_out(QUICK, replace(moving, motion_deg=0.0, hidden_texels=0.0))}
-    assert found["inpaint.filler"] == 40
+    assert found["one_fit"] == 60 - ONE_FIT_SHARE * 15
     assert found["pose_residual"] == pytest.approx(RESIDUAL_SHARE * 35)
     assert Omission("hidden", None, "why").seconds(stages) is None
     assert Omission("x", 1, "why", {"fit/stage9": 1.0}).seconds(stages) is None
@@ -294,4 +305,4 @@ def test_what_an_omission_saves_is_its_share_of_the_stages_of_earlier_runs(tmp_p
 def test_a_measure_can_be_made_by_hand():
     """Methods of others build one for their own tests."""
     scene = SceneMeasure(1, 0, 1, 0, 1, 0, 0, motion_deg=0, turn_deg=0, pixel_mm=3, surface_mm=1500, occlusion={})
-    assert [o.field for o in leave_out(QUICK, scene)] == ["pose_residual", "inpaint.filler"]
+    assert [o.field for o in leave_out(QUICK, scene)] == ["pose_residual", "one_fit"]

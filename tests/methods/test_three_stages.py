@@ -12,16 +12,18 @@ import pytest
 
 from ihbench.errors import BadInput
 from ihbench.ledger import Ledger
+from ihbench.methods.inpainthuman.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.config import QUICK, InpaintHumanConfig, config_from, outside_files
 from ihbench.methods.inpainthuman.inpainting.mini_weights import save_mini
 from ihbench.methods.inpainthuman.inpainting.personalise import ADAPT_STATE, TI_STATE
 from ihbench.methods.inpainthuman.method import InpaintHuman
-from ihbench.methods.inpainthuman.stage1 import Stage1
+from ihbench.methods.inpainthuman.stage1 import Stage1, draw, loss_of, prepare_target
+from ihbench.metrics.ssim import ssim_map
 from ihbench.progress import Progress
 from ihbench.protocol import load_protocol
 from ihbench.run_loop import RunRequest, _outside
 from ihbench.threads import one_torch_thread
-from tests.bench.fake_capture import a_camera, a_pose, train_view
+from tests.bench.fake_capture import a_camera, a_pose, the_body, train_view
 from tests.methods.sd2_miniature import make_miniature
 from tests.methods.tiny_diffusion import tiny_backbone
 from tests.methods.tiny_fit import SIZE, TINY, equal_bits, parameters_of, training_set
@@ -89,15 +91,34 @@ def test_always_personalises_for_a_person_whom_nothing_hides(mini):
     views = [train_view(a_camera(0.0, SIZE), a_pose(0.1 * k, 0.1 * k), slice(0, 0), frame=k) for k in range(4)]
     learned = {"fit/stage2/textual-inversion", "fit/stage2/adapt"}
     avatars = []
-    for always, filler in ((False, "diffusion"), (True, "diffusion"), (False, "none")):
-        ledger, method = Ledger(), InpaintHuman(config(mini, always=always, filler=filler))
+    for always in (False, True):
+        ledger, method = Ledger(), InpaintHuman(config(mini, always=always))
         avatars.append(method.fit(training_set(views), device="cpu", seed=0, ledger=ledger, progress=QUIET))
         done = set(ledger.state()["stages"])
         assert learned & done == (learned if always else set())
         assert "fit/stage2/inpaint" not in done
         assert "fit/stage3" in done
-        assert ("fit/stage2" in done) == (filler != "none")
-    assert all(equal_bits(parameters_of(avatars[0]), parameters_of(avatar)) for avatar in avatars[1:])
+    assert equal_bits(*(parameters_of(avatar) for avatar in avatars))
+
+
+def test_one_fit_is_stage_1_with_ssim_and_more_steps(mini):
+    ledger = Ledger()
+    given = replace(config(mini), one_fit=True, steps=20)
+    assert given.fit_steps == 24
+    one = fit(given, ledger)
+    assert set(ledger.state()["stages"]) == {"fit", "fit/prepare", "fit/stage1", "checkpoint"}
+    assert outside_files(given) == []
+    avatar = GaussianAvatar(replace(given, one_fit=False), the_body(), one.betas, 0)
+    avatar.load_state_dict(one.state_dict())
+    avatar.residual_on = one.residual_on
+    (view, *_) = hidden_person().views
+    target = prepare_target(avatar, view)
+    plain, more = (loss_of(each, target, (1.0, 1.0, 1.0)).item() for each in (avatar, one))
+    rgb = draw(avatar, target, (1.0, 1.0, 1.0)).rgb.detach().numpy().astype(np.float64)
+    known = (target.person + target.background > 0).numpy()
+    similarity = ssim_map(rgb, np.where(known, target.image.numpy(), rgb))
+    inside = target.person.numpy()[..., 0] > 0
+    assert more - plain == pytest.approx(0.2 * (1 - similarity)[inside].mean(), rel=1e-3)
 
 
 @pytest.mark.parametrize("filler", ["mean", "telea", "navier-stokes", "push-pull", "mirror", "temporal"])
@@ -124,25 +145,29 @@ from tests.bench.fake_capture import a_camera, a_pose, train_view
 from tests.methods.tiny_fit import SIZE, TINY, training_set
 
 def told(when):
-    print(when, *(name for name in ("diffusers", "transformers") if name in sys.modules))
+    modules = ("ihbench.methods.inpainthuman.stage2", "diffusers", "transformers")
+    print(when, *(name.rpartition(".")[2] for name in modules if name in sys.modules))
 
 honest = Stage1.run
 Stage1.run = lambda *a: (honest(*a), told("fitted"))
-inpaint = replace(InpaintConfig(), filler=sys.argv[1], weights=sys.argv[2], key_views=1, turntable=1)
+one_fit = sys.argv[1] == "one fit"
+filler = "diffusion" if one_fit else sys.argv[1]
+inpaint = replace(InpaintConfig(), filler=filler, weights=sys.argv[2], key_views=1, turntable=1)
 if inpaint.filler == "diffusion":
     inpaint = replace(inpaint, ti=False, lora=False, sg=False)
-config = replace(TINY, steps=2, inpaint=inpaint, refine=replace(QUICK.refine, steps=1, lpips=0.0))
+config = replace(TINY, steps=2, one_fit=one_fit, inpaint=inpaint, refine=replace(QUICK.refine, steps=1, lpips=0.0))
 views = [train_view(a_camera(0.0, SIZE), a_pose(0.1 * k, 0.1 * k), slice(28, 36), frame=k) for k in range(2)]
 InpaintHuman(config).fit(training_set(views), device="cpu", seed=0, ledger=Ledger(), progress=Progress.silent())
 told("painted")
 """
 
 
-@pytest.mark.parametrize("filler", ["temporal", "diffusion"])
-def test_diffusers_is_imported_by_the_painter_that_needs_it(filler):
+@pytest.mark.parametrize(
+    ("filler", "loaded"), [("one fit", ""), ("temporal", " stage2"), ("diffusion", " stage2 diffusers transformers")]
+)
+def test_diffusers_is_imported_by_the_painter_that_needs_it(filler, loaded):
     words = [sys.executable, "-c", WHAT_IS_IMPORTED, filler, ""]
     done = subprocess.run(words, capture_output=True, text=True, timeout=300, cwd=Path(__file__).parents[2])
-    loaded = " diffusers transformers" if filler == "diffusion" else ""
     assert done.stdout.splitlines() == ["fitted", f"painted{loaded}"], done.stderr
 
 

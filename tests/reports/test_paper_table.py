@@ -211,10 +211,10 @@ def test_components_are_told_from_the_switches():
     assert ablated(switches([128], on=False)) == {"MS Maps": "", "TI": "", "SG": "", "inpainting": ""}
     # a simple filler knows neither a word nor a part map
     assert ablated(switches(filler="mirror")) == {"MS Maps": "✓", "TI": "", "SG": "", "inpainting": "✓"}
-    assert ablated(switches(filler="none")) == {"MS Maps": "✓", "TI": "", "SG": "", "inpainting": ""}
+    assert ablated(switches() | {"one_fit": True}) == {"MS Maps": "✓", "TI": "", "SG": "", "inpainting": ""}
     assert set(ablated({"steps": 3}).values()) == {"?"}
 
 
 def test_what_the_plan_left_out_is_not_there():
-    left_out = [{"field": "inpaint.filler", "value": "none", "reason": "nothing hidden"}]
+    left_out = [{"field": "one_fit", "value": True, "reason": "nothing hidden"}]
     assert ablated(switches(), left_out=left_out) == {"MS Maps": "✓", "TI": "", "SG": "", "inpainting": ""}

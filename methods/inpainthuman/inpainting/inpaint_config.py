@@ -8,7 +8,7 @@ from typing import Any, Literal
 from ihbench.errors import BadInput
 
 TOKEN = "<someone>"
-Filler = Literal["diffusion", "none", "mean", "telea", "navier-stokes", "push-pull", "mirror", "temporal"]
+Filler = Literal["diffusion", "mean", "telea", "navier-stokes", "push-pull", "mirror", "temporal"]
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,7 @@ class InpaintConfig:
     """Personalise the painter also where nothing needs painting, as the paper's text has it. Only good for measuring
     what leaving that out saves."""
     filler: Filler = "diffusion"
-    """What paints hidden pixels: the paper's diffusion model, or one of the simple fills beside it in tables. "none":
-    nothing is painted, and stage 3 refines what the frames show."""
+    """What paints hidden pixels: the paper's diffusion model, or one of the simple fills beside it in tables."""
     backbone: Literal["mini", "sd2"] = "mini"
     """The diffusion model: the small one that comes with the bench, or your own Stable Diffusion 2 inpainting."""
     weights: str = ""
