@@ -147,7 +147,7 @@ def _comparisons(
         for pair, p in zip(tested, holm([pair["p"] for pair in tested]), strict=True):
             pair["p_adjusted"] = p
         if tested:  # the smallest p is multiplied by the number of tests
-            impossible.append(len(tested) * min(pair["smallest_p"] for pair in tested))
+            impossible.append(min(len(tested) * min(pair["smallest_p"] for pair in tested), 1.0))
     found = [row for row in found if any(row["scores"].values())]
     if not found:
         return [], []

@@ -14,7 +14,7 @@ import numpy as np
 from ihbench import diagram
 from ihbench.metrics import Identity
 from ihbench.metrics.identity import METRICS
-from ihbench.metrics.statistics import interval_ends
+from ihbench.metrics.statistics import Interval, interval_ends
 from ihbench.quality_time import QualityCurve, error_of, pareto_set
 from ihbench.reports.configurations import Configuration, configurations, short_value, sweeps
 from ihbench.reports.run_time import (
@@ -40,6 +40,7 @@ DRAWN = 3  # metrics at most, in one figure
 GRID = 40  # times at which a mean curve is drawn
 CROWD = 5  # configurations; of more, only the mean curves are drawn
 LEGEND_WIDTH = 88  # characters
+ROOM = 1.5  # times the largest value, and part of the smallest, that a work-precision diagram shows of intervals
 PROFILE_POINT = "all switches as the profile has them"
 
 
@@ -104,9 +105,7 @@ def _work_precision(
     labels: list[tuple[Axes, list[diagram.Label], list[list[tuple[float, float]]]]] = []
     for panel, (identity, points) in zip(axes, found.items(), strict=True):
         front = pareto_set([p.seconds.value for p in points], [p.error.value for p in points])
-        diagram.logarithmic(
-            panel, [x for p in points for x in _ends(p.seconds)], [y for p in points for y in _ends(p.error)]
-        )
+        diagram.logarithmic(panel, _shown([p.seconds for p in points]), _shown([p.error for p in points]))
         labels.append((panel, *_points(panel, points, handles)))
         steps = [_at(points[k]) for k in front]
         if len(steps) > 1:
@@ -121,7 +120,8 @@ def _work_precision(
         diagram.place_labels(panel, beside, lines)
     caption = (
         f"Work-precision of {title} ({about}): error in region {headline} against seconds of fitting, both "
-        f"logarithmic; bars are {LEVEL:.0%} intervals over scenes, or over repeats of a single one."
+        f"logarithmic; bars are {LEVEL:.0%} intervals over scenes, or over repeats of a single one, and "
+        "may run out of the picture."
     )
     return [(diagram.save(drawn, path, rows), caption)]
 
@@ -177,8 +177,15 @@ def _bars(panel: Axes, p: WorkPoint, colour: str) -> None:
             panel.plot(*((ends, middle) if along_x else (middle, ends)), color=colour, lw=1, alpha=0.3, zorder=2)
 
 
-def _ends(interval: Any) -> list[float]:
-    return [v for v in (interval.value, interval.low, interval.high) if math.isfinite(v) and v > 0]
+def _shown(intervals: Sequence[Interval]) -> list[float]:
+    """What an axis must hold: all values, and of their intervals what lies near. Intervals over two or three scenes
+    may be so wide that the points would fall into one; their bars then run out of the picture."""
+    values = [i.value for i in intervals if math.isfinite(i.value) and i.value > 0]
+    if not values:
+        return []
+    low, high = min(values) / ROOM, max(values) * ROOM
+    ends = [end for i in intervals for end in (i.low, i.high) if math.isfinite(end) and end > 0]
+    return [*values, *(min(max(end, low), high) for end in ends)]
 
 
 def _csv_row(p: WorkPoint, identity: str, on_front: bool, scenes: Sequence[str]) -> dict[str, Any]:

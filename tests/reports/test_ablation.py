@@ -45,6 +45,9 @@ def test_with_too_many_comparisons_for_the_scenes_it_says_so(tmp_path):
     text, _ = told(runs, (("first", "low", "mid"), ("both", "low", "high")))
     assert "*" not in text.partition("What each component")[2].partition("[95%")[0]
     assert "no adjusted p can be below 0.062, so nothing can be marked" in text
+    runs = {name: rung(tmp_path / "two", 20 + k, "ab") for k, name in enumerate(("low", "mid", "high"))}
+    text, _ = told(runs, (("first", "low", "mid"), ("second", "mid", "high"), ("both", "low", "high")))
+    assert "no adjusted p can be below 1, so nothing can be marked" in text
 
 
 def test_what_one_rung_lost_is_not_compared(tmp_path):

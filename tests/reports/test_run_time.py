@@ -8,9 +8,10 @@ import re
 
 import pytest
 
+from ihbench.metrics.statistics import Interval
 from ihbench.quality_time import Target
 from ihbench.reports.configurations import configurations, sweeps
-from ihbench.reports.figures import draw
+from ihbench.reports.figures import ROOM, _shown, draw
 from ihbench.reports.markdown import markdown, write
 from ihbench.reports.run_time import across_sizes_section, run_time_section, work_points
 from tests.reports.made_up_runs import FLIP, PSNR, made_up, sweep
@@ -235,6 +236,15 @@ def test_the_csv_holds_what_the_figure_shows(tmp_path):
     curves = list(csv.DictReader(drawn[1].with_suffix(".csv").open()))
     assert {row["kind"] for row in curves} == {"mean"}  # six configurations are a crowd
     assert {row["identity"] for row in curves} == {x.format(r) for x in (PSNR, FLIP) for r in ("body", "hidden")}
+
+
+def test_an_axis_holds_all_points_and_of_their_bars_what_lies_near():
+    """Over two scenes an interval may span decades, and the points would fall into one."""
+    wide, narrow = (Interval(v, low, high, 0.95, 2, "t") for v, low, high in ((0.1, 0.001, 20.0), (0.2, 0.19, 0.21)))
+    assert sorted(_shown([wide, narrow])) == pytest.approx([0.1 / ROOM, 0.1, 0.19, 0.2, 0.21, 0.2 * ROOM])
+    alone = Interval(0.1, math.nan, math.nan, 0.95, 1, "")
+    assert _shown([alone]) == [0.1]
+    assert _shown([Interval(math.nan, math.nan, math.nan, 0.95, 0, "")]) == []
 
 
 def test_few_configurations_show_their_checkpoints_too(tmp_path):
