@@ -15,9 +15,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ihbench.methods.inpainthuman.dissimilarity import dissimilarity, where_known
 from ihbench.methods.inpainthuman.inpainting.painted_view import PaintedView
 from ihbench.methods.inpainthuman.refine_config import RefineConfig
-from ihbench.metrics.ssim_torch import ssim_map_torch
 from ihbench.scene import MaskState
 
 Perceptual = Callable[[Tensor, Tensor], Tensor]  # two images [h, w, 3] in [0, 1] -> a distance
@@ -80,12 +80,9 @@ def refine_loss(
     if config.background > 0:
         loss = loss + config.background * (error * target.cleared).sum() / (3 * total)
     if config.ssim > 0 or perceptual is not None:
-        # no gradient where nobody knows: a window that reaches there compares the avatar with itself
-        seen = target.unknown * rgb.detach() + (1 - target.unknown) * rgb
-        wanted = torch.where(target.unknown > 0, rgb.detach(), target.image)
+        seen, wanted = where_known(rgb, target.image, target.unknown)
         if config.ssim > 0:
-            similarity = ssim_map_torch(seen.permute(2, 0, 1), wanted.permute(2, 0, 1)).permute(1, 2, 0)
-            loss = loss + config.ssim * ((1 - similarity) * target.weight).sum() / (3 * total)
+            loss = loss + config.ssim * dissimilarity(seen, wanted, target.weight)
         if perceptual is not None:
             inside = target.weight > 0
             pair = (torch.where(inside, image, target.off) for image in (seen, wanted))

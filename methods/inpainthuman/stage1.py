@@ -11,15 +11,15 @@ from torch import Tensor
 from ihbench.camera import Camera
 from ihbench.ledger import Ledger
 from ihbench.methods.inpainthuman.avatar import GaussianAvatar
+from ihbench.methods.inpainthuman.config import ONE_FIT_SSIM
+from ihbench.methods.inpainthuman.dissimilarity import dissimilarity, where_known
 from ihbench.methods.inpainthuman.optimisation import Optimisation
-from ihbench.metrics.ssim_torch import ssim_map_torch
 from ihbench.render.splat import render_gaussians
 from ihbench.scene import MaskState, TrainingSet, TrainView
 from ihbench.views import LazyViews
 
 MARGIN = 0.15  # of the projected body's box on every side: garments and pose errors stay inside the window
 STATE = "stage1"
-SSIM_WEIGHT = 0.2  # of `one_fit`; stage 3's (sec. 3.4)
 TARGETS_HELD = 256  # prepared views kept in memory, about 2 MB each in the paper profile
 
 
@@ -123,16 +123,10 @@ def loss_of(avatar: GaussianAvatar, target: Target, background: tuple[float, flo
     """`initial_loss` of what the avatar shows of a target; of `one_fit` with 1 - SSIM over visible person pixels."""
     drawn = draw(avatar, target, background)
     loss = initial_loss(avatar, drawn, target)
-    return loss + SSIM_WEIGHT * _dissimilarity(drawn.rgb, target) if avatar.config.one_fit else loss
-
-
-def _dissimilarity(rgb: Tensor, target: Target) -> Tensor:
-    """Mean of 1 - SSIM over visible person pixels. In windows that reach unknown pixels the avatar is compared with
-    itself there, as in stage 3."""
-    known, own = target.person + target.background > 0, rgb.detach()
-    seen, wanted = torch.where(known, rgb, own), torch.where(known, target.image, own)
-    similarity = ssim_map_torch(seen.permute(2, 0, 1), wanted.permute(2, 0, 1)).permute(1, 2, 0)
-    return ((1 - similarity) * target.person).sum() / (3 * target.person.sum().clamp(min=1))
+    if not avatar.config.one_fit:
+        return loss
+    unknown = 1 - target.person - target.background
+    return loss + ONE_FIT_SSIM * dissimilarity(*where_known(drawn.rgb, target.image, unknown), target.person)
 
 
 class Stage1(Optimisation):

@@ -91,6 +91,7 @@ def test_the_plan_changes_only_what_nobody_has_set(moving, keep, texels):
     request = RunRequest(load_protocol("zju_occ"), "inpainthuman", own, keep=keep)
     config, left_out, withheld = _planned(request, far)
     assert withheld == list(keep)
+    assert _planned(replace(request, keep=("channels",)), far)[2] == []  # nothing wanted to change it
     assert config.levels == (128, 256)
     assert config.texels == (LEAST_TEXELS if texels == 32 else texels)
     assert "levels" not in [o.field for o in left_out]

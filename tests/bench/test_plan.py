@@ -203,6 +203,10 @@ def test_nothing_is_painted_where_every_frame_shows_all(moving, monkeypatch):
     for needed in ({"turntable": 4}, {"context": "frame"}, {"on": False}, {"always": True}):
         config = replace(QUICK, inpaint=replace(QUICK.inpaint, **needed))
         assert not [o for o in leave_out(config, seen) if o.field == "one_fit"]
+    for other in ({"steps": 0}, {"steps": 400}, {"ssim": 0.0}):  # another stage 3 than the one it was compared with
+        config = replace(QUICK, refine=replace(QUICK.refine, **other))
+        assert not [o for o in leave_out(config, seen) if o.field == "one_fit"]
+    assert not [o for o in leave_out(PAPER, seen) if o.field == "one_fit"]
     monkeypatch.setattr(method_config, "locate", lambda file: Path("trunk"))  # stage 3 has LPIPS, the one fit has not
     assert not [o for o in leave_out(QUICK, seen) if o.field == "one_fit"]
 
