@@ -104,11 +104,8 @@ def test_always_personalises_for_a_person_whom_nothing_hides(mini):
 def test_one_fit_is_stage_1_with_ssim_and_more_steps(mini):
     ledger = Ledger()
     given = replace(config(mini), one_fit=True, steps=20)
-    assert (
-        given.fit_steps
-        == 24
-        == Stage1(GaussianAvatar(given, the_body(), np.zeros(10), 0), hidden_person(), 0, ledger).steps
-    )
+    unfitted = GaussianAvatar(given, the_body(), np.zeros(10), 0)
+    assert Stage1(unfitted, hidden_person(), 0, Ledger()).steps == given.fit_steps == 24
     one = fit(given, ledger)
     assert set(ledger.state()["stages"]) == {"fit", "fit/prepare", "fit/stage1", "checkpoint"}
     assert outside_files(given) == []
