@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from ihbench.visible_text import visible
+
 
 class BadInput(Exception):
     """A file, folder, name, shape or unit the user gave is wrong, or something needed is missing.
 
     The message is one line: what, where, what was expected, what to do. The command line prints it and ends
-    with status 2.
+    with status 2. It may quote names from anywhere: as text it is safe to print.
     """
+
+    def __str__(self) -> str:
+        return visible(super().__str__())
 
 
 class Diverged(Exception):
@@ -18,6 +23,6 @@ class Diverged(Exception):
     """
 
     def __init__(self, step: int, reason: str):
-        super().__init__(f"diverged at step {step}: {reason}")
+        super().__init__(visible(f"diverged at step {step}: {reason}"))
         self.step = step
         self.reason = reason

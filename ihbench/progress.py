@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TextIO
 
+from ihbench.visible_text import visible
+
 PLAIN_EVERY = 10.0  # s between two plain lines of one task
 MODES = ("auto", "bar", "plain", "silent")
 
@@ -55,7 +57,7 @@ class Progress:
                 if self._bars is None:
                     self._bars = _rich_bars(self.stream)
                     self._bars.start()
-                task.bar = self._bars.add_task(description, total=total, note="")
+                task.bar = self._bars.add_task(task.description, total=total, note="")
             yield task
         finally:
             self._open_tasks -= 1
@@ -63,6 +65,7 @@ class Progress:
 
     def say(self, text: str) -> None:
         """One line of its own, above the bars."""
+        text = visible(text, keep="\n")
         if self._bars is not None:
             self._bars.console.print(text, markup=False, highlight=False)
         elif self.mode != "silent":
@@ -82,7 +85,7 @@ class Task:
     """One running piece of work; made by `Progress.task`."""
 
     def __init__(self, progress: Progress, description: str, total: int | None) -> None:
-        self.description = description
+        self.description = visible(description)
         self.total = total
         self.done = 0
         self.lines_said = 0
@@ -108,9 +111,9 @@ class Task:
 
     def note(self, text: str) -> None:
         """A word on the state of things, shown beside the count from now on."""
-        self._note = text
+        self._note = visible(text)
         if self.bar is not None:
-            self._progress._bars.update(self.bar, note=text)
+            self._progress._bars.update(self.bar, note=self._note)
 
     def count(self) -> str:
         return f"{self.done}" if self.total is None else f"{self.done}/{self.total}"

@@ -121,3 +121,17 @@ def test_an_unknown_mode_is_refused():
 )
 def test_durations_read_well_near_their_borders(seconds, text):
     assert duration(seconds) == text
+
+
+@pytest.mark.parametrize("mode", ["bar", "plain"])
+def test_names_bring_no_escape_sequences_to_the_terminal(mode):
+    stream, clock = Terminal(), Clock()
+    progress = Progress(mode, stream, clock)
+    with progress.task("a\x1b]0;title\x07", total=1) as task:
+        task.note("b\u202ec")
+        progress.say("d\x1b[2Je\nf")
+        clock.now += 20.0
+        task.advance()
+    shown = stream.getvalue()
+    assert "d\\x1b[2Je\nf" in shown
+    assert not [text for text in ("\x07", "\u202e", "\x1b]", "\x1b[2J") if text in shown]
