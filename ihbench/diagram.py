@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ihbench import atomic
+from ihbench.visible_text import visible
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,6 +46,7 @@ STYLE: Any = {  # as matplotlib names them
 DPI = 150
 TICKS_1 = (1, 2, 3, 4, 5, 6, 7, 8, 9)
 APART = 7.0  # px between a label and a point
+FORMULA = ("=", "+", "-", "@", "\t", "\r")  # what a spreadsheet runs
 LETTER = 0.6  # mean width of a letter over the font's size
 
 
@@ -79,6 +81,11 @@ def save(drawn: Figure, path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
     return path.parent / f"{path.name}.png"
 
 
+def words(text: str) -> str:
+    """Text that matplotlib draws as it is: no mathematics between dollars, no leading _ that hides a legend entry."""
+    return f"{' ' * text.startswith('_')}{visible(text, keep=chr(10))}".replace("$", r"\$")
+
+
 def settle(drawn: Figure) -> None:
     """Lay the figure out once and for all; what is added afterwards moves nothing."""
     engine = drawn.get_layout_engine()
@@ -101,9 +108,19 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 def _cell(value: Any) -> Any:
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return ""
-    if isinstance(value, str) and value[:1] in ("=", "+", "-", "@", "\t", "\r"):
-        return "'" + value  # a spreadsheet would take it for a formula
-    return repr(value) if isinstance(value, float) else value
+    return repr(value) if isinstance(value, float) else harmless(value)
+
+
+def harmless(value: Any) -> Any:
+    """A CSV's cell. Names from elsewhere must not become formulas in a spreadsheet; numbers may be negative."""
+    if not isinstance(value, str):
+        return value
+    try:
+        float(value)
+    except ValueError:
+        shown = visible(value)
+        return "'" + shown if value.startswith(FORMULA) else shown
+    return value
 
 
 def logarithmic(axes: Axes, x: Sequence[float], y: Sequence[float]) -> None:
@@ -216,8 +233,8 @@ def place_labels(
         dx, dy, leader = offsets[k]
         boxes = np.concatenate([boxes, found[k : k + 1]])
         axes.annotate(
-            label.text, label.point, xytext=(dx / scale, dy / scale), textcoords="offset points", fontsize=size,
-            color=label.colour, zorder=5,
+            words(label.text), label.point, xytext=(dx / scale, dy / scale), textcoords="offset points",
+            fontsize=size, color=label.colour, zorder=5,
             arrowprops={"arrowstyle": "-", "color": "#999999", "lw": 0.6} if leader else None,
         )  # fmt: skip
     return lost

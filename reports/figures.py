@@ -334,7 +334,7 @@ def _name_axes(panel: Axes, identity: str, below: str) -> None:
 
 def _finish(drawn: Figure, handles: dict[str, Any], title: str, about: str) -> None:
     """Title on top, legend below, outside the axes."""
-    drawn.suptitle(f"{title}\n{about}", fontsize=11)
-    texts = [fill(label, LEGEND_WIDTH) for label in handles]
+    drawn.suptitle(diagram.words(f"{title}\n{about}"), fontsize=11)
+    texts = [diagram.words(fill(label, LEGEND_WIDTH)) for label in handles]
     columns = 1 if max(len(t) for t in texts) > 42 or len(texts) < 3 else 2
     drawn.legend(list(handles.values()), texts, loc="outside lower center", ncols=columns, frameon=False)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import html
 from base64 import b64encode
 from collections.abc import Sequence
-from html import escape
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -12,11 +12,13 @@ from ihbench.quality_time import Target
 from ihbench.reports.content import general_report
 from ihbench.reports.document import Block, Bullets, Heading, Paragraph, Picture, Table, Words, spans
 from ihbench.reports.figures import draw
+from ihbench.reports.run_pictures import run_pictures
 from ihbench.results import RunResult
+from ihbench.visible_text import visible
 
 TAGS = {"strong": "strong", "emphasis": "em", "code": "code"}
 # even if something slipped through the escaping, a browser that obeys this neither runs it nor loads anything
-POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; form-action 'none'; base-uri 'none'"
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #1a1a1a; background: #fff; margin: 2rem auto; max-width: 74rem;
   padding: 0 1rem; }
@@ -41,11 +43,13 @@ def write(
     pictures: Sequence[tuple[Path, str]] = (),  # file, caption
     folder: Path = Path("."),  # where the text will lie; this report needs nothing beside it
 ) -> str:
-    """The report of these runs; see `general_report`. Without pictures it draws its own."""
+    """The report of these runs; see `general_report`. The runs' own pictures are in it, and diagrams: the ones given,
+    else its own."""
+    own = run_pictures(results)
     if pictures:
-        return page(general_report(results, presets, targets, pictures))
+        return page(general_report(results, presets, targets, [*pictures, *own]))
     with TemporaryDirectory() as name:
-        return page(general_report(results, presets, targets, draw(results, Path(name))))
+        return page(general_report(results, presets, targets, [*draw(results, Path(name)), *own]))
 
 
 def page(blocks: Sequence[Block], title: str = "ihbench report") -> str:
@@ -62,6 +66,11 @@ def page(blocks: Sequence[Block], title: str = "ihbench report") -> str:
             "</body></html>\n",
         ]
     )
+
+
+def escape(text: str) -> str:
+    """Text that a browser shows as it is, in an attribute too."""
+    return html.escape(visible(text))
 
 
 def _block(block: Block) -> str:

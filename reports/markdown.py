@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
+from urllib.parse import quote
 
 from ihbench.quality_time import Target
 from ihbench.reports.content import general_report
 from ihbench.reports.document import Block, Bullets, Heading, Paragraph, Picture, Table, Words, spans
 from ihbench.results import RunResult
+from ihbench.visible_text import visible
 
 MARKS = {"strong": "**", "emphasis": "*", "code": "`"}
 
@@ -36,16 +39,16 @@ def _block(block: Block, folder: Path) -> str:
         case Heading(level, text):
             return f"{'#' * level} {plain(text)}"
         case Paragraph(words):
-            return _words(words)
+            return _line(words)
         case Bullets(items):
-            return "\n".join(f"- {_words(item)}" for item in items)
+            return "\n".join(f"- {_line(item)}" for item in items)
         case Table():
             rule = "---|" * block.left + "---:|" * (len(block.head) - block.left)
             rows = ["| " + " | ".join(_words(cell) for cell in row) + " |" for row in (block.head, *block.rows)]
             return "\n".join([rows[0], f"|{rule}", *rows[1:]])
         case Picture(png, caption):
             where = Path(os.path.relpath(png, folder)).as_posix()
-            return f"![{plain(caption).replace(']', '')}](<{where}>)\n\n{plain(caption)}"
+            return f"![{plain(caption).replace(']', '')}](<{quote(where)}>)\n\n{plain(caption)}"
     raise TypeError(f"report: expected a block of document.py, got {type(block).__name__}")
 
 
@@ -60,12 +63,30 @@ def _words(words: Words) -> str:
     )
 
 
+# what GitHub's Markdown would take for an entity, emphasis, mathematics, code, a link, an address or a mention
+LIVE = re.compile(
+    r"""&(?=\#?\w+;) | [\\*~$`] | (?<![^\W_])_ | _(?![^\W_]) | \](?=[(\[]) | !(?=\[)
+    | (?<=:)/(?=/) | (?<=[wW]{3})\. | (?<=[\w.+-])@(?=[\w-]+\.) | [<|]""",
+    re.VERBOSE,
+)
+OTHERWISE = {"&": "&amp;", "@": "<!-- -->@", "<": "&lt;"}  # where a backslash does not help, or shows
+OPENS = re.compile(r"(?=[#>+=\[-])|(?<=\d)(?=[.)])")
+
+
 def plain(text: str) -> str:
-    """Text that neither ends a table's cell or line nor is taken for HTML. Spaces at its ends stay."""
-    inner = " ".join(text.split()).replace("|", "\\|").replace("<", "&lt;")
+    """Text that a reader sees as it is: it ends neither a table's cell nor a line, and makes no link, picture, style
+    or HTML. Spaces at its ends stay."""
+    inner = LIVE.sub(lambda found: OTHERWISE.get(found[0], "\\" + found[0]), visible(" ".join(text.split())))
     before, after = (" " if text[:1].isspace() else ""), (" " if text[-1:].isspace() else "")
     return before + inner + after if inner else before
 
 
+def _line(words: Words) -> str:
+    """Words that begin a line of their own."""
+    text = _words(words)
+    first = re.match(r"\s*(?:[#>+=\[-]|\d+[.)])", text)
+    return text if first is None else OPENS.sub(r"\\", first[0], count=1) + text[first.end() :]
+
+
 def _bare(text: str) -> str:
-    return " ".join(text.split()).replace("|", "\\|").replace("`", "'")
+    return visible(" ".join(text.split())).replace("|", "\\|").replace("`", "'")

@@ -9,13 +9,13 @@ import math
 from typing import Any
 
 from ihbench import atomic
+from ihbench.diagram import harmless
 from ihbench.reports.paper_table import Block, Cell, Frame, Row
 
 FIELDS: tuple[str, ...] = (
     "table", "block", "kind", "row", "section", "calibration", "group", "metric", "unit", "text", "value", "low",
     "high", "scenes", "status", "mark", "reason", "identity", "footnotes",
 )  # fmt: skip
-FORMULA = ("=", "+", "-", "@", "\t", "\r")  # what a spreadsheet runs
 
 
 def write_csv(frame: Frame) -> str:
@@ -38,7 +38,7 @@ def write_csv(frame: Frame) -> str:
                     "unit": column.metric.unit,
                     **{key: _csv_value(value) for key, value in _cell(frame, cell).items()},
                 }
-                lines.writerow({key: _harmless(value) for key, value in about.items()})
+                lines.writerow({key: harmless(value) for key, value in about.items()})
     return out.getvalue()
 
 
@@ -52,7 +52,7 @@ def write_json(frame: Frame) -> str:
         "footnotes": dict(frame.footnotes),
         "notes": list(frame.notes),
     }
-    return json.dumps(atomic.encode(content), ensure_ascii=False, indent=1) + "\n"
+    return json.dumps(atomic.encode(content), indent=1) + "\n"
 
 
 def _block(frame: Frame, block: Block) -> dict[str, Any]:
@@ -99,14 +99,3 @@ def _csv_value(value: Any) -> Any:
     if isinstance(value, float):
         return "" if math.isnan(value) else repr(value)
     return " | ".join(value) if isinstance(value, list) else value
-
-
-def _harmless(value: Any) -> Any:
-    """Names from elsewhere must not become formulas; numbers may be negative."""
-    if not isinstance(value, str) or not value.startswith(FORMULA):
-        return value
-    try:
-        float(value)
-    except ValueError:
-        return "'" + value
-    return value

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from html import escape
-
-from ihbench.reports.html import POLICY, STYLE
+from ihbench.reports.html import POLICY, STYLE, escape
 from ihbench.reports.paper_table import Block, Cell, Frame, Row
 
 MARKS = {"best": "<strong>{}</strong>", "second": "<u>{}</u>", "": "{}"}

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import os
 import re
 from html import unescape
 from html.parser import HTMLParser
 
+import cmarkgfm
 import pytest
+from cmarkgfm.cmark import Options
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
-from ihbench.reports import html, latex, markdown
+from ihbench import diagram
+from ihbench.errors import BadInput, Diverged
+from ihbench.reports import html, latex, markdown, table_html
 from ihbench.reports.content import general_report
 from ihbench.reports.document import Bullets, Heading, Paragraph, Table, code, strong
 from tests.reports.made_up_runs import made_up
@@ -137,9 +143,73 @@ def test_pictures_are_named_relative_to_where_the_text_lies(tmp_path):
     picture.parent.mkdir(parents=True)
     picture.write_bytes(b"\x89PNG")
     shown = {"pictures": [(picture, "What | it <shows>")], "folder": tmp_path / "out"}
-    assert "(<figures/a b.png>)" in markdown.write([], **shown)
+    assert "(<figures/a%20b.png>)" in markdown.write([], **shown)
     assert r"\detokenize{figures/a b.png}" in latex.write([], **shown)
     assert "data:image/png;base64,iVBORw==" in html.write([], **shown)
+
+
+LIVELY = [
+    "[a](http://x.y)", "![a](http://x.y/z.png)",
+    "http://x.y", "www.x.y", "me@x.org", "[a]: http://x.y", "[a][b]", "<b>",
+    "&lt;b&gt;", "&#60;b", "a|b", "a\\|b", "*a*", "_a_", "~~a~~", "`a`", "# a", "- a", "1. a", "> a", "[![a](b)](c)",
+    "**", "=", "+ a", "a\\", "$a$", "https:/\\/x.y", "zju_occ@1", "[-0.2, +0.3]",
+]  # fmt: skip
+UNSEEN = "a\x1b[31mb\x07\u202ec\u2066d\u200be\u2028f\x9bg\U000e0041h\ud800"
+
+
+@pytest.mark.parametrize("text", LIVELY)
+def test_markdown_of_any_name_shows_it_and_links_nothing(text):
+    source = markdown.markdown([Paragraph(text), Bullets((text,)), Table(("h",), ((text,),)), Heading(2, text)])
+    page = cmarkgfm.github_flavored_markdown_to_html(source, options=Options.CMARK_OPT_UNSAFE)
+    allowed = {"p", "ul", "li", "table", "thead", "tbody", "tr", "th", "td", "h2"}
+    assert set(parsed(page).tags) == allowed
+    cells = [re.sub("<!--.*?-->", "", cell) for cell in re.findall(r"<(?:p|li|td|h2)>(.*?)</(?:p|li|td|h2)>", page)]
+    assert [unescape(cell) for cell in cells] == [text] * 4
+
+
+def csv_cell(_):
+    return diagram.harmless(UNSEEN)
+
+
+@pytest.mark.parametrize("write", [markdown.markdown, latex.latex, html.page, csv_cell])
+def test_unseen_characters_reach_no_report(write):
+    text = write(
+        [Heading(2, UNSEEN), Paragraph((UNSEEN, strong(UNSEEN), code(UNSEEN))), Table((UNSEEN,), ((UNSEEN,),))]
+    )
+    assert not set(UNSEEN) & set(text) - set("a[31mbcdefgh")
+    text.encode()
+
+
+@pytest.mark.parametrize("error", [BadInput(UNSEEN), Diverged(3, UNSEEN)])
+def test_unseen_characters_of_names_do_not_reach_the_terminal_with_an_error(error):
+    assert str(error).isprintable()
+
+
+@pytest.mark.parametrize("text", ["$\\frac$", "_hidden", "a\x1bb", "$"])
+def test_diagrams_take_any_name(text, tmp_path):
+    drawn, (panel,) = diagram.figure()
+    (line,) = panel.plot([1, 2], [1, 2])
+    drawn.legend([line], [diagram.words(text)])
+    diagram.place_labels(panel, [diagram.Label((1, 1), text)])
+    svg = diagram.save(drawn, tmp_path / "a", []).with_suffix(".svg").read_text()
+    assert text.replace("\x1b", "\\x1b") in svg
+
+
+@pytest.mark.parametrize("page", [html.page([]), table_html.POLICY])
+def test_the_pages_policy_forbids_forms_and_another_base(page):
+    assert "form-action 'none'" in unescape(page)
+    assert "base-uri 'none'" in unescape(page)
+
+
+def test_the_page_has_the_runs_own_pictures_and_survives_spoiled_ones(tmp_path):
+    good, linked, text = (made_up(tmp_path, scene) for scene in "abc")
+    Image.new("RGB", (8, 8)).save(good.folder / "contact_sheet.png")
+    (linked.folder / "contact_sheet.png").symlink_to(good.folder / "contact_sheet.png")
+    (text.folder / "contact_sheet.png").write_text("no picture")
+    os.mkfifo(text.folder / "inpainting.png")
+    page = html.write([good, linked, text])
+    assert page.count(": test views (p@1, quick)</figcaption>") == 1
+    assert "ours on a, seed 0: test views" in page
 
 
 def test_a_row_of_the_wrong_length_is_refused():
