@@ -40,14 +40,13 @@ from ihbench.datasets.people_snapshot import (
     stacked,
     subject_folders,
 )
-from ihbench.datasets.pictures import decoded, encoded, one_line, opened
 from ihbench.errors import BadInput
+from ihbench.files.pictures import encoded, one_line, read_mask, read_rgb, size_of
 from ihbench.scene import BodyPose
 
 SPLITS = ("train", "test")
 IMAGES, MASKS, CAMERA, POSES = "images", "masks", "cam_parms", "smpl_parms.pth"
 PICTURES = (".png", ".jpg", ".jpeg")
-PERSON_FROM = 128
 LARGEST_FRAME = 1_000_000  # stems above are no frame numbers (dates, …)
 
 
@@ -141,8 +140,7 @@ class GaussianAvatarCapture(SnapshotFolder):
             elif not (np.allclose(K, first[1], rtol=1e-6) and np.allclose(E, first[2], atol=1e-6)):
                 raise BadInput(f"{path}: another camera than {first[0]}; expected one fixed camera for all images")
         assert first is not None
-        with opened(self._stored[self.frames[0]].image) as picture:
-            width, height = picture.size
+        width, height = size_of(self._stored[self.frames[0]].image)
         return Camera.from_opencv(first[1], first[2][:, :3], first[2][:, 3], width, height)
 
     def body_pose(self, frame: int) -> BodyPose:
@@ -154,7 +152,7 @@ class GaussianAvatarCapture(SnapshotFolder):
         """[H, W, 3] RGB, as stored."""
         self.check_index(camera, frame)
         path = self._where(frame).image
-        image = decoded(path, "RGB")
+        image = read_rgb(path)
         self.check_size(path, image, self._camera)
         return image
 
@@ -165,10 +163,9 @@ class GaussianAvatarCapture(SnapshotFolder):
         path = self.mask_path(frame)
         if not path.is_file():
             raise BadInput(f"{path}: no such file; expected the mask of frame {frame}{self.standin_hint}")
-        mask = decoded(path, None)
-        mask = mask if mask.ndim == 2 else mask.max(2)
+        mask = read_mask(path, "half")
         self.check_size(path, mask, self._camera)
-        return mask if mask.dtype == bool else mask >= PERSON_FROM
+        return mask
 
     def content_digest(self, camera: int, frame: int, source: str = "mask") -> bytes:
         """Hash of the bytes of the frame's image and mask files; a missing file counts as empty."""

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -28,8 +28,8 @@ from ihbench.camera import Camera
 from ihbench.datasets.capture_folder import CaptureFolder
 from ihbench.datasets.overlap import Overlap, overlap_of, overlap_problems
 from ihbench.datasets.pickles import write_pickle
-from ihbench.datasets.pictures import decoded, encoded, opened
 from ihbench.errors import BadInput
+from ihbench.files.pictures import encoded, read_mask, read_rgb, size_of
 from ihbench.registry import nearest
 from ihbench.safe_pickle import load_pickle
 from ihbench.scene import BodyPose
@@ -116,8 +116,7 @@ class HumanNerfCapture(CaptureFolder):
         E = _numbers(entry, "extrinsics", (4, 4), path, name)
         D = _numbers(entry, "distortions", (5,), path, name) if "distortions" in entry else None
         if camera not in self._sizes:
-            with opened(self._picture("images", name)) as picture:
-                self._sizes[camera] = picture.size
+            self._sizes[camera] = size_of(self._picture("images", name))
         return Camera.from_opencv(K, E[:3, :3], E[:3, 3], *self._sizes[camera], D)
 
     def body_pose(self, frame: int) -> BodyPose:
@@ -156,13 +155,13 @@ class HumanNerfCapture(CaptureFolder):
 
     def image(self, camera: int, frame: int) -> NDArray[np.uint8]:
         """[H, W, 3] RGB, as stored."""
-        return self._read("images", camera, frame, "RGB")
+        return self._read("images", camera, frame, read_rgb)
 
     def silhouette(self, camera: int, frame: int, source: str = "mask") -> NDArray[np.bool_]:
         """[H, W]. The preparation has joined the original's masks: "mask" and "union" are the same here."""
         if source not in ("mask", "union"):
             raise BadInput(f"{self.folder}: silhouette source {source!r}: this layout has joined masks only")
-        return self._read("masks", camera, frame, "L") >= 128
+        return self._read("masks", camera, frame, lambda path: read_mask(path, "half"))
 
     def content_digest(self, camera: int, frame: int, source: str = "mask") -> bytes:
         digest = hashlib.sha256()
@@ -182,7 +181,7 @@ class HumanNerfCapture(CaptureFolder):
         """Whether the copy lists this view."""
         return (self.camera_ids[camera], frame) in self._names
 
-    def _read(self, kind: str, camera: int, frame: int, mode: str) -> NDArray[np.uint8]:
+    def _read(self, kind: str, camera: int, frame: int, read: Callable[[Path], NDArray]) -> NDArray:
         self.check_index(camera, frame)
         name = self._names.get((self.camera_ids[camera], frame))
         if name is None:
@@ -190,7 +189,7 @@ class HumanNerfCapture(CaptureFolder):
         path = self._picture(kind, name)
         if not path.is_file():
             raise BadInput(f"{path}: no such file; cameras.pkl lists it")
-        picture = decoded(path, mode)
+        picture = read(path)
         size = self.camera(camera)
         if picture.shape[:2] != (size.height, size.width):
             raise BadInput(

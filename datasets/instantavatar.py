@@ -41,8 +41,8 @@ from ihbench.datasets.people_snapshot import (
     stacked,
     subject_folders,
 )
-from ihbench.datasets.pictures import decoded, encoded
 from ihbench.errors import BadInput
+from ihbench.files.pictures import above_half, encoded, read_rgb
 from ihbench.safe_pickle import load_npy
 from ihbench.scene import BodyPose
 
@@ -136,7 +136,7 @@ class InstantAvatarCapture(SnapshotFolder):
         path = self.image_path(frame)
         if not path.is_file():
             raise BadInput(f"{path}: no such file; expected the image of frame {frame}{self.standin_hint}")
-        image = decoded(path, "RGB")
+        image = read_rgb(path)
         self.check_size(path, image, self._camera)
         return image
 
@@ -276,7 +276,7 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
     if not (np.isfinite([lowest, highest]).all() and lowest >= -0.01 and highest <= 255):
         raise BadInput(f"{path}: expected 0 to 1, or 0 to 255, found {lowest:g} to {highest:g}")
     # a soft mask of 0 to 1 may overshoot a little where it was resampled
-    return mask > (0.5 if highest <= 1.5 else 127.5)
+    return above_half(mask, 1 if highest <= 1.5 else 255)
 
 
 # ----------------------------------------------------------------------------------------------- check

@@ -33,9 +33,9 @@ from ihbench.camera import Camera
 from ihbench.datasets.capture_folder import CaptureFolder
 from ihbench.datasets.overlap import share_inside
 from ihbench.datasets.pickles import write_pickle
-from ihbench.datasets.pictures import decoded, encoded, opened
 from ihbench.datasets.visible_overlap import VisibleOverlap, visible_overlap, visible_problems
 from ihbench.errors import BadInput
+from ihbench.files.pictures import encoded, read_mask, read_rgb, size_of
 from ihbench.registry import nearest
 from ihbench.safe_pickle import load_pickle
 from ihbench.scene import BodyPose
@@ -81,7 +81,7 @@ class OneCameraCapture(CaptureFolder, ABC):
         path = self.image_path(camera, frame)
         if not path.is_file():
             raise BadInput(f"{path}: no such file; expected the image of frame {frame}{self.standin_hint}")
-        image = decoded(path, "RGB")
+        image = read_rgb(path)
         self._check_size(path, image)
         return image
 
@@ -92,11 +92,9 @@ class OneCameraCapture(CaptureFolder, ABC):
         path = self.mask_path(camera, frame)
         if not path.is_file():
             raise BadInput(f"{path}: no such file; {self._mask_hint}{self.standin_hint}")
-        with opened(path) as picture:
-            mode = picture.mode
-        mask = decoded(path, "RGB" if mode in ("P", "PA", "CMYK") else None)  # OccFusion reads the palette's red
+        mask = read_mask(path, "first channel")  # OccFusion reads a palette's red
         self._check_size(path, mask)
-        return (mask if mask.ndim == 2 else mask[..., 0]) != 0
+        return mask
 
     def content_digest(self, camera: int, frame: int, source: str = "mask") -> bytes:
         """Hash of the bytes of a frame's image and mask file; a missing or unreadable one counts as empty."""
@@ -130,8 +128,7 @@ class OneCameraCapture(CaptureFolder, ABC):
         path = next((path for path in self._images if path.is_file()), None)
         if path is None:
             raise BadInput(f"{self._images[0].parent}: no image in it; expected the frames{self.standin_hint}")
-        with opened(path) as picture:
-            return picture.size
+        return size_of(path)
 
     def _check_size(self, path: Path, picture: NDArray) -> None:
         width, height = self._image_size

@@ -40,8 +40,8 @@ from ihbench.datasets.ocmotion import (
     ten_betas,
 )
 from ihbench.datasets.pickles import write_pickle
-from ihbench.datasets.pictures import encoded, one_line
 from ihbench.errors import BadInput
+from ihbench.files.pictures import encoded, one_line
 from ihbench.registry import nearest
 from ihbench.safe_pickle import load_pickle
 from ihbench.scene import BodyPose

@@ -37,8 +37,8 @@ from ihbench.camera import Camera
 from ihbench.datasets.capture_folder import CaptureFolder
 from ihbench.datasets.overlap import Overlap, overlap_of, overlap_problems, share_inside
 from ihbench.datasets.pickles import write_pickle
-from ihbench.datasets.pictures import one_line
 from ihbench.errors import BadInput
+from ihbench.files.pictures import above_half, one_line
 from ihbench.registry import nearest
 from ihbench.safe_pickle import load_pickle
 from ihbench.scene import BodyPose
@@ -464,7 +464,11 @@ class MaskFile:
                 raise BadInput(
                     f"{self.path}: mask {number} is damaged ({one_line(error)}); copy the file again"
                 ) from error
-        return mask > 0.5 if mask.dtype.kind == "f" else mask != 0
+        if mask.dtype.kind != "f":
+            return mask != 0
+        if not (np.isfinite(mask).all() and mask.min() >= 0 and mask.max() <= 255):
+            raise BadInput(f"{self.path}: mask {number}: expected 0 to 1, or 0 to 255, found other numbers or NaN")
+        return above_half(mask, 1 if mask.max() <= 1 else 255)
 
 
 class Video:
@@ -536,6 +540,11 @@ class Video:
             raise BadInput(f"{self.path}: not a readable video ({one_line(error)}); copy the file again") from error
         if not opened:
             raise BadInput(f"{self.path}: cut short, or not a video that OpenCV reads; copy the file again")
+        if turned := int(stream.get(cv2.CAP_PROP_ORIENTATION_META)):
+            raise BadInput(
+                f"{self.path}: shown turned by {turned}°, says its header; write it anew without that, its frames "
+                f"turned as the camera and the masks have them"
+            )
         return stream
 
 

@@ -17,7 +17,7 @@ import re
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -32,9 +32,9 @@ from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera
 from ihbench.datasets.capture_folder import CaptureFolder
 from ihbench.datasets.overlap import share_inside
-from ihbench.datasets.pictures import decoded, encoded
 from ihbench.datasets.standin_mark import STANDIN_FILE
 from ihbench.errors import BadInput
+from ihbench.files.pictures import encoded, one_line, read_mask, read_rgb
 from ihbench.registry import nearest
 from ihbench.scene import BodyPose
 
@@ -133,7 +133,7 @@ class PlainCapture(CaptureFolder):
         try:
             return replace(load_body(path), name="own")
         except (zlib.error, NotImplementedError, RuntimeError) as error:
-            raise BadInput(f"{path}: damaged ({_one_line(error)}); write the file again") from error
+            raise BadInput(f"{path}: damaged ({one_line(error)}); write the file again") from error
 
     def camera(self, camera: int) -> Camera:
         self.check_index(camera, 0)
@@ -155,14 +155,13 @@ class PlainCapture(CaptureFolder):
 
     def image(self, camera: int, frame: int) -> NDArray[np.uint8]:
         """[H, W, 3] RGB, as stored; an alpha channel is dropped."""
-        return self._read_picture("images", camera, frame, "RGB")
+        return self._read_picture("images", camera, frame, read_rgb)
 
     def silhouette(self, camera: int, frame: int, source: str = "mask") -> NDArray[np.bool_]:
         """[H, W] non-zero in masks/. `source` is "mask", there is no other."""
         if source != "mask":
             raise BadInput(f"silhouette source {source!r}: {nearest(source, ['mask'])}")
-        mask = self._read_picture("masks", camera, frame, None)
-        return (mask if mask.ndim == 2 else mask.max(2)) != 0
+        return self._read_picture("masks", camera, frame, lambda path: read_mask(path, "non-zero"))
 
     def content_digest(self, camera: int, frame: int, source: str = "mask") -> bytes:
         """Hash of the bytes of one view's image and mask file; a missing file counts as empty."""
@@ -204,7 +203,7 @@ class PlainCapture(CaptureFolder):
             self._listings[key] = listing
         return self._listings[key]
 
-    def _read_picture(self, kind: str, camera: int, frame: int, mode: str | None) -> NDArray[np.uint8]:
+    def _read_picture(self, kind: str, camera: int, frame: int, read: Callable[[Path], NDArray]) -> NDArray:
         number = self.number(frame)
         paths = self.files(kind, camera).get(number, [])
         if len(paths) > 1:
@@ -214,10 +213,7 @@ class PlainCapture(CaptureFolder):
             path = self.picture_folder(kind, camera) / f"{number:06d}.png"
             or_else = " or .jpg" if kind == "images" else ""
             raise BadInput(f"{path}{or_else}: no such file; {POSES_FILE} has frame {number}{self.standin_hint}")
-        try:
-            picture = decoded(paths[0], mode)
-        except ValueError as error:  # a 16-bit picture, say
-            raise BadInput(f"{paths[0]}: cannot be made 8-bit RGB ({_one_line(error)}); save it as such") from error
+        picture = read(paths[0])
         view = self.camera(camera)
         if picture.shape[:2] != (view.height, view.width):
             raise BadInput(
@@ -239,10 +235,6 @@ def _pictures(folder: Path, endings: Sequence[str]) -> list[Path]:
 
 def _is_number(stem: str) -> bool:
     return re.fullmatch(r"[0-9]{1,18}", stem) is not None
-
-
-def _one_line(error: object) -> str:
-    return " ".join(str(error).split())[:120]
 
 
 def read_about(folder: Path) -> dict[str, str]:
@@ -413,7 +405,7 @@ def _read_npz(path: Path) -> dict[str, NDArray]:
         *(NotImplementedError, RuntimeError, SyntaxError, TypeError),  # what damaged archives and headers raise
     ) as error:
         raise BadInput(
-            f"{path}: cannot be read as a .npz of plain arrays ({_one_line(error)}); write the file again"
+            f"{path}: cannot be read as a .npz of plain arrays ({one_line(error)}); write the file again"
         ) from None
     for key, value in arrays.items():
         if key not in POSE_KEYS:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ihbench import atomic
 from ihbench.datasets import gaussianavatar, humannerf, instantavatar, ocmotion_w2a, zju_mocap, zju_refine
-from ihbench.datasets.pictures import encoded
+from ihbench.files.pictures import encoded
 from ihbench.prepare import Handout
 
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 import hashlib
 import io
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -29,8 +29,8 @@ from ihbench.camera import Camera
 from ihbench.datasets.capture_folder import CaptureFolder
 from ihbench.datasets.overlap import Overlap, overlap_of, overlap_problems
 from ihbench.datasets.pickles import write_object
-from ihbench.datasets.pictures import decoded, encoded, opened
 from ihbench.errors import BadInput
+from ihbench.files.pictures import encoded, read_mask, read_rgb, size_of
 from ihbench.registry import nearest
 from ihbench.safe_pickle import load_npy
 from ihbench.scene import BodyPose
@@ -141,7 +141,7 @@ class ZjuCapture(CaptureFolder):
     def image(self, camera: int, frame: int) -> NDArray[np.uint8]:
         """[H, W, 3] RGB, as stored."""
         path = self.image_path(camera, frame)
-        image = self._read_picture(path, "RGB")
+        image = self._read_picture(path, read_rgb)
         self._check_size(path, image, camera)
         return image
 
@@ -152,9 +152,8 @@ class ZjuCapture(CaptureFolder):
         person = None
         for kind in SILHOUETTES[source]:
             path = self.mask_path(camera, frame, kind)
-            mask = self._read_picture(path)
-            self._check_size(path, mask, camera)
-            here = (mask if mask.ndim == 2 else mask.max(2)) != 0
+            here = self._read_picture(path, lambda path: read_mask(path, "non-zero"))
+            self._check_size(path, here, camera)
             person = here if person is None else person | here
         assert person is not None
         return person
@@ -197,15 +196,14 @@ class ZjuCapture(CaptureFolder):
                 folder = self.image_path(camera, 0).parent
                 state = "no image in it" if folder.is_dir() else "no such folder"
                 raise BadInput(f"{folder}: {state}; expected the images of camera {camera}{self.standin_hint}")
-            with opened(path) as picture:
-                self._sizes[camera] = picture.size
+            self._sizes[camera] = size_of(path)
         return self._sizes[camera]
 
-    def _read_picture(self, path: Path, mode: str | None = None) -> NDArray[np.uint8]:
+    def _read_picture(self, path: Path, read: Callable[[Path], NDArray]) -> NDArray:
         if not path.is_file():
             missing = "file" if path.parent.is_dir() else f"file, nor its folder {path.parent.name}"
             raise BadInput(f"{path}: no such {missing}; annots.npy lists it{self.standin_hint}")
-        return decoded(path, mode)
+        return read(path)
 
     def _check_size(self, path: Path, picture: NDArray, camera: int) -> None:
         width, height = self._image_size(camera)

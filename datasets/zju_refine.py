@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from ihbench import atomic
 from ihbench.body import Body
 from ihbench.datasets import zju_mocap
-from ihbench.datasets.pictures import encoded
 from ihbench.datasets.zju_mocap import ZjuCapture, ZjuMocap
 from ihbench.errors import BadInput
+from ihbench.files.pictures import encoded
 
 PREFIX = "my_"
 PARAMS = "smpl_params"

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ihbench.files.pictures import encoded
+
 COLUMNS = ("training input", "truth", "prediction", "error x4")
 PAD, LABEL = 6, 18  # px
 GREY = 70
@@ -64,15 +66,9 @@ def contact_sheet(rows: Sequence[SheetRow], title: str, zoom: int = 1) -> NDArra
 
 def write_png(path: Path, image: NDArray[np.uint8]) -> None:
     """Write an RGB image whole or not at all. Raises `BadInput` when the disk does not take it."""
-    import io
-
-    from PIL import Image
-
     from ihbench.atomic import write_bytes
 
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, "PNG", compress_level=1)
-    write_bytes(path, buffer.getvalue(), durable=False)
+    write_bytes(path, encoded(image, "PNG", compress_level=1), durable=False)
 
 
 def _to_8bit(image: NDArray[np.float32]) -> NDArray[np.uint8]:

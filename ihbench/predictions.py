@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from ihbench import registry
 from ihbench.errors import BadInput
+from ihbench.files.pictures import read_picture
 from ihbench.metrics.images import Color
 from ihbench.views import TestViewKey
 
@@ -31,7 +32,6 @@ DEFAULT_PATTERNS = ("{scene}/{camera}/{frame:06d}.png", "{camera}/{frame:06d}.pn
 PLACEHOLDERS = ("scene", "camera", "camera_index", "frame", "index")
 SUFFIXES = (".png", ".jpg", ".jpeg", ".npy")
 LOSSY = (".jpg", ".jpeg")
-LARGEST_SIDE = 16384  # px; a header that says more is not believed
 
 
 @dataclass(frozen=True)
@@ -144,41 +144,9 @@ def read_image(path: Path, background: Color) -> NDArray:
 
 
 def _read_picture(path: Path) -> NDArray:
-    from PIL import Image
-
-    try:
-        with Image.open(path) as picture:
-            if max(picture.size) > LARGEST_SIDE:
-                raise BadInput(
-                    f"prediction {path}: {picture.size[0]}×{picture.size[1]} px; expected a test view's size"
-                )
-            if picture.mode in ("I", "I;16", "I;16B", "F"):
-                return np.asarray(picture).astype(np.float32) / (1 if picture.mode == "F" else 65535)
-            if picture.mode == "P":
-                picture = picture.convert("RGBA" if "transparency" in picture.info else "RGB")
-            if picture.mode not in ("L", "LA", "RGB", "RGBA"):
-                picture = picture.convert("RGB")
-            image = np.asarray(picture)
-    except BadInput:
-        raise
-    except Exception as error:  # a damaged file may raise anything
-        raise BadInput(f"prediction {path}: cannot be read as an image ({error})") from error
-    return _read_16_bit(path, image) if path.suffix.lower() == ".png" and image.ndim == 3 else image
-
-
-def _read_16_bit(path: Path, image: NDArray) -> NDArray:
-    """Colour PNG of 16 bits, of which Pillow keeps eight."""
-    with open(path, "rb") as file:
-        header = file.read(25)
-    if header[24:25] != b"\x10":
-        return image
-    import cv2
-
-    deep = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
-    if deep is None or deep.dtype != np.uint16 or deep.ndim != 3:
-        raise BadInput(f"prediction {path}: cannot be read as a 16-bit PNG")
-    order = [2, 1, 0, 3][: deep.shape[2]]  # OpenCV has blue first
-    return deep[..., order].astype(np.float32) / 65535
+    """[H, W, C] uint8, or float in [0, 1] of 16 bits."""
+    values = read_picture(path, f"prediction {path}").values
+    return values if values.dtype == np.uint8 else values.astype(np.float32) / 65535
 
 
 def _read_array(path: Path) -> NDArray:

@@ -17,13 +17,13 @@ import numpy as np
 from ihbench import atomic
 from ihbench.camera import Camera, look_at
 from ihbench.datasets import ocmotion_w2a
-from ihbench.datasets.pictures import encoded
 from ihbench.datasets.standin import motion
 from ihbench.datasets.standin.cast import cast_names, open_cast
 from ihbench.datasets.standin.furniture import furnish, furniture_view
 from ihbench.datasets.standin.photograph import photograph
 from ihbench.datasets.standin.studio import empty_studio
 from ihbench.datasets.standin.subject import Subject
+from ihbench.files.pictures import encoded
 from ihbench.progress import Progress
 
 VERSION = 1  # of the generator; a change that moves a pixel raises it

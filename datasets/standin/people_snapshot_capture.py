@@ -18,12 +18,12 @@ from ihbench import atomic
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera, look_at
 from ihbench.datasets import people_snapshot
-from ihbench.datasets.pictures import encoded
 from ihbench.datasets.standin import motion
 from ihbench.datasets.standin.cast import cast_names, open_cast
 from ihbench.datasets.standin.photograph import Photograph, photograph
 from ihbench.datasets.standin.studio import empty_studio
 from ihbench.datasets.standin.subject import Subject
+from ihbench.files.pictures import encoded
 from ihbench.progress import Progress
 from ihbench.scene import BodyPose
 

@@ -200,15 +200,16 @@ def test_a_folder_of_body_files_has_one_for_each_gender(tmp_path, files, gender,
 
 def test_a_large_capture_opens_without_decoding_an_image(tmp_path, monkeypatch):
     """646 frames of 23 cameras: headers only, whatever the number of images."""
-    from ihbench.datasets import pictures, zju_mocap
+    from ihbench.datasets import zju_mocap
     from ihbench.datasets.layouts import ZJU_MOCAP
+    from ihbench.files import pictures
 
     folder = tmp_path / "CoreView_386"
     cameras = [a_camera(0.27 * k) for k in range(23)]
     zju_mocap.write_annots(folder, cameras, zju_mocap.standard_image_paths(23, 646))
     (folder / "new_params").mkdir()
     read = []
-    monkeypatch.setattr(pictures, "opened", lambda path: read.append(path))
+    monkeypatch.setattr(pictures, "_opened", lambda path, _: read.append(path))
     capture = ZJU_MOCAP(tmp_path).open("386")
     assert (capture.n_frames, len(capture.camera_ids)) == (646, 23)
     assert capture.image_path(22, 645).name == "000645.jpg"

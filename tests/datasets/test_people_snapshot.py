@@ -7,6 +7,7 @@ import os
 import pickle
 import shutil
 import stat
+import struct
 import threading
 
 import h5py
@@ -411,6 +412,30 @@ def test_frames_in_any_order_are_exact(written):
     assert len(video._kept) <= people_snapshot.KEPT_PICTURES
     video.frame(4)[:] = 0  # what is handed out may be painted on
     np.testing.assert_array_equal(video.frame(4), forward[4])
+
+
+def test_a_video_that_is_shown_turned_is_refused(raw):
+    """Players and OpenCV turn the frames, camera.pkl and the masks do not say whether they are turned."""
+    path = raw / f"{SUBJECT}.mp4"
+    data = bytearray(path.read_bytes())
+    upright = struct.pack(">9i", 65536, 0, 0, 0, 65536, 0, 0, 0, 1 << 30)
+    at = data.index(upright, data.index(b"tkhd"))
+    data[at : at + 36] = struct.pack(">9i", 0, 65536, 0, -65536, 0, 0, 0, 0, 1 << 30)
+    path.write_bytes(data)
+    with pytest.raises(BadInput, match=r"shown turned by (90|270)°") as error:
+        PeopleSnapshotRaw(raw.parent).open(SUBJECT)
+    message(error)
+
+
+@pytest.mark.parametrize("scale", [1, 255, np.nan])
+def test_soft_masks_of_floating_point_numbers(raw, scene, scale):
+    rewrite_hdf5(raw / "masks.hdf5", masks=(0.2 + 0.6 * np.stack(scene.masks).astype(np.float32)) * scale)
+    capture = PeopleSnapshotRaw(raw.parent).open(SUBJECT)
+    if np.isfinite(scale):
+        np.testing.assert_array_equal(capture.silhouette(0, 3), scene.masks[3])
+    else:
+        with pytest.raises(BadInput, match="mask 3: expected 0 to 1"):
+            capture.silhouette(0, 3)
 
 
 def test_threads_share_a_capture(written, scene):

@@ -7,6 +7,7 @@ import time
 import zipfile
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -187,6 +188,15 @@ def test_masks_of_any_kind(copy, written):
     ):
         picture.save(path)
         np.testing.assert_array_equal(PlainScene(copy).open("dance").silhouette(0, 0), person)
+
+
+def test_sixteen_bits_are_scaled(copy, written):
+    image = written[1]["left", 3]
+    assert cv2.imwrite(str(copy / "images/left/000003.png"), image[..., 1].astype(np.uint16) * 257)
+    capture = PlainScene(copy).open("dance")
+    np.testing.assert_array_equal(capture.image(0, 0), np.repeat(image[..., 1:2], 3, 2))
+    Image.fromarray(image[..., 1].astype(np.float32)).save(copy / "images/left/000003.png", "TIFF")
+    assert any("floating-point" in problem for problem in problems_of(copy))
 
 
 def test_poses_in_every_layout(copy, own_body):

@@ -1,0 +1,1 @@
+"""Files that come from elsewhere: one reader for each kind."""
