@@ -18,25 +18,30 @@ class EarlierRuns:
 
     count: int
     same_switches: bool  # whether they have the profile's
+    same_code: bool  # whether they were made by this code
     seconds: float  # median total
     stages: Mapping[str, float]  # ledger path -> median seconds, over the runs that had the stage
 
 
-def earlier_runs(runs: Path, method: str, protocol: str, profile: str, cpu: str) -> EarlierRuns | None:
+def earlier_runs(runs: Path, method: str, protocol: str, profile: str, cpu: str, code: str) -> EarlierRuns | None:
     """Those under the folder `runs`; None without any. `protocol` is its name with version and changes. Runs with the
-    profile's own switches come first, and where some needed everything, the stages are theirs."""
+    profile's own switches come first, of these those of this code, and where some needed everything, the stages are
+    theirs."""
     found = list(_finished(runs, method, protocol, profile, cpu))
-    plain = [(about, ledger) for about, ledger in found if not about.get("changed")]
+    plain = [run for run in found if not run[0].get("changed")]
     chosen = plain or found
     if not chosen:
         return None
+    same_code = [run for run in chosen if run[2] == code]
+    chosen = [(about, ledger) for about, ledger, _ in same_code or chosen]
     whole = [(about, ledger) for about, ledger in chosen if not _planned_away(about)] or chosen
     stages: dict[str, list[float]] = {}
     for _, ledger in whole:
         for path, stage in ledger["stages"].items():
             stages.setdefault(path, []).append(float(stage["seconds"]))
     seconds = median(float(about["total_seconds"]) for about, _ in chosen)
-    return EarlierRuns(len(chosen), bool(plain), seconds, {path: median(values) for path, values in stages.items()})
+    medians = {path: median(values) for path, values in stages.items()}
+    return EarlierRuns(len(chosen), bool(plain), bool(same_code), seconds, medians)
 
 
 def _planned_away(about: Mapping[str, Any]) -> bool:
@@ -45,8 +50,8 @@ def _planned_away(about: Mapping[str, Any]) -> bool:
 
 def _finished(
     runs: Path, method: str, protocol: str, profile: str, cpu: str
-) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
-    """`about` and ledger. A damaged record tells nothing about time and is passed over."""
+) -> Iterator[tuple[dict[str, Any], dict[str, Any], str]]:
+    """`about`, ledger and code. A damaged record tells nothing about time and is passed over."""
     wanted = (method, protocol, profile, cpu)
     for path in sorted(runs.glob("*/run.json")):
         try:
@@ -62,4 +67,4 @@ def _finished(
                 float(stage["seconds"])
         except (BadInput, AttributeError, KeyError, TypeError, ValueError):
             continue
-        yield about, ledger
+        yield about, ledger, str(identity.get("code"))

@@ -34,6 +34,8 @@ GROUPS = {
     "metric preset": "ihbench.presets",
 }
 
+ROOMS = ("methods", "datasets", "protocols", "reports")  # of the bench: content, found by name
+
 
 @cache
 def _found(kind: str) -> dict[str, EntryPoint]:
@@ -77,3 +79,35 @@ def package_folder(kind: str, name: str) -> Path:
         if spec and spec.submodule_search_locations:
             return Path(next(iter(spec.submodule_search_locations)))
     raise BadInput(f"{kind} {name!r}: its package {module!r} cannot be found")
+
+
+def source(kind: str, name: str) -> Path:
+    """The folder or file with the code behind a name: of another distribution its top package or module, whole; of
+    one of the bench's rooms the package that registers the name; else the bench. Imports none of them."""
+    module = entry_point(kind, name).module
+    top, *inner = module.split(".")
+    if top == "ihbench" and inner:
+        spec = find_spec(f"{top}.{inner[0]}")
+        places = list(spec.submodule_search_locations or ()) if spec is not None else []
+        if not places or inner[0] not in ROOMS:
+            return Path(__file__).parent
+        return _deepest(Path(places[0]), inner[1:])
+    spec = find_spec(top)
+    if spec is not None and spec.origin is not None:
+        origin = Path(spec.origin)
+        return origin.parent if spec.submodule_search_locations else origin
+    for place in (spec.submodule_search_locations or ()) if spec is not None else ():  # folders without __init__.py
+        found = _deepest(Path(place), inner)
+        if found != Path(place):
+            return found
+    raise BadInput(f"{kind} {name!r}: the source of {module!r} cannot be found")
+
+
+def _deepest(folder: Path, inner: list[str]) -> Path:
+    """The innermost package on the way to a module; the module's own file where none is inside."""
+    for part in inner:
+        if not (folder / part).is_dir():
+            file = folder / f"{part}.py"
+            return file if file.is_file() and not (folder / "__init__.py").is_file() else folder
+        folder = folder / part
+    return folder

@@ -16,25 +16,27 @@ from ihbench.errors import BadInput
 from ihbench.metrics.evaluate import Preset, find_preset
 from ihbench.predictions import read_image
 from ihbench.progress import Progress
-from ihbench.reopen import reopen_scene
+from ihbench.reopen import reopen_protocol, reopen_scene
 from ihbench.results import view_rows
 from ihbench.score_stage import ScoreStage, render_path
 from ihbench.scoring import LoadedView, Scorer, ViewScores
+from ihbench.source_digest import bench_code
 from ihbench.store import RunFolder
 
 
 def rescore(folder: Path, preset: str, data: Path | None, body: Path | None, progress: Progress) -> None:
     """Score a run's renders and its calibration rows under a preset, into `presets/NAME.jsonl` of the run folder.
 
-    What is there already is left, unless a metric was absent for want of something that is here now. Raises
-    `BadInput` for an unknown preset, a run that is not done, and data that are not the run's.
+    What is there already is left, unless other code made it or a metric was absent for want of something that is here
+    now. Raises `BadInput` for an unknown preset, a run that is not done, and data that are not the run's.
     """
     chosen = find_preset(preset)
     run = RunFolder.open(folder)
     if run.status != "done":
         raise BadInput(f"{folder}: is {run.status}, only finished runs have renders to score")
     file = folder / "presets" / f"{chosen.name}.jsonl"
-    if file.is_file() and not _has_become_possible(file, chosen):
+    code = bench_code(reopen_protocol(folder), (chosen.name,))
+    if file.is_file() and _stands(file, chosen, code):
         return
     scene, model = reopen_scene(folder, data, body)
     scorer = Scorer.build(scene, model, [chosen.name])
@@ -48,7 +50,7 @@ def rescore(folder: Path, preset: str, data: Path | None, body: Path | None, pro
                 results[row].append(scores)
             task.advance()
         lines = [line for row, scores in results.items() for line in view_rows(row, scores)]
-        atomic.write_json_lines(file, [{"lacking": list(chosen.lacking())}, *lines])
+        atomic.write_json_lines(file, [{"lacking": list(chosen.lacking()), "code": code}, *lines])
 
 
 def _render(run: RunFolder, loaded: LoadedView) -> NDArray | None:
@@ -56,8 +58,11 @@ def _render(run: RunFolder, loaded: LoadedView) -> NDArray | None:
     return read_image(path, (1.0, 1.0, 1.0)) if path.is_file() else None
 
 
-def _has_become_possible(file: Path, preset: Preset) -> bool:
-    """Whether a metric that was absent when the file was written can be computed now."""
-    lines = atomic.read_json_lines(file)
-    before = set(lines[0].get("lacking", ())) if lines else {"unknown"}
-    return bool(before - set(preset.lacking()))
+def _stands(file: Path, preset: Preset, code: str) -> bool:
+    """Whether the file would come out the same now: by this code, and without a metric that was absent then and can
+    be computed now."""
+    try:
+        head = atomic.read_json_lines(file)[0]
+        return head["code"] == code and set(head["lacking"]) <= set(preset.lacking())
+    except (BadInput, IndexError, KeyError, TypeError):
+        return False  # damaged, or of a version that did not say

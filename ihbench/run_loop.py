@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench import __version__, machine, registry
+from ihbench import machine, registry
 from ihbench.capture_digest import capture_digest
 from ihbench.config_fields import flat, with_fields
 from ihbench.data_source import DataSource, locate
@@ -31,13 +31,13 @@ from ihbench.results import RunResult
 from ihbench.scene import Avatar, Capture, Method, TestView, TrainingSet
 from ihbench.score_stage import ScoreStage, spread
 from ihbench.scoring import Scorer
+from ihbench.source_digest import code_of, shipped_digest
 from ihbench.store import RunFolder, RunIdentity
 from ihbench.views import OccludedScene, open_scene
 
 if TYPE_CHECKING:
     from ihbench.body import Body
 
-ENDS = 1 << 16  # bytes
 CURVE_VIEWS = 6  # test views on which the quality-time curve is measured
 
 
@@ -144,7 +144,7 @@ def run_identity(request: RunRequest, capture: Capture, body: Body) -> RunIdenti
         profile=request.protocol.profile,
         seed=request.seed,
         body=body.content_sha(),
-        code=f"{__version__}+{_source_digest(registry.package_folder('method', request.method))}",
+        code=code_of(request.protocol, request.method),
     )
 
 
@@ -267,15 +267,6 @@ def _changed(request: RunRequest, withheld: list[str]) -> list[str]:
     return [*changed, f"keep={','.join(withheld)}"] if withheld else changed
 
 
-def _source_digest(package: Path) -> str:
-    """Hash of a method's own source files and shipped weights: edited code is another run."""
-    digest = hashlib.sha256()
-    files = [path for ending in ("*.py", "*.safetensors") for path in package.rglob(ending)]
-    for path in sorted(files):
-        digest.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()[:8]
-
-
 def _outside(request: RunRequest) -> dict[str, str]:
     """A hash of files outside the package that the configuration names, such as weights: same path, other content is
     another run. A method's config module lists them as `outside_files(config)`; it may have none."""
@@ -286,11 +277,6 @@ def _outside(request: RunRequest) -> dict[str, str]:
     digest = hashlib.sha256()
     for named_path in map(Path, found):
         for path in [named_path] if named_path.is_file() else sorted(p for p in named_path.rglob("*") if p.is_file()):
-            size = path.stat().st_size
-            with path.open("rb") as file:  # both ends: whole weights of gigabytes would take minutes
-                ends = file.read(ENDS)
-                file.seek(max(size - ENDS, 0))
-                ends += file.read(ENDS)
             inside = path.relative_to(named_path if named_path.is_dir() else named_path.parent)
-            digest.update(f"{inside.as_posix()}\0{size}\0".encode() + ends)
+            digest.update(inside.as_posix().encode(errors="surrogateescape") + b"\0" + shipped_digest(path))
     return {"outside": digest.hexdigest()[:8]}

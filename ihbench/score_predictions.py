@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ihbench import __version__
 from ihbench.capture_digest import capture_digest
 from ihbench.data_source import DataSource
 from ihbench.predictions import Predictions, find_predictions
@@ -15,13 +16,14 @@ from ihbench.recorded_run import RecordedRun, about_scene, recorded
 from ihbench.results import RunResult, read_result
 from ihbench.score_stage import ScoreStage
 from ihbench.scoring import Scorer
+from ihbench.source_digest import bench_code
 from ihbench.store import RunFolder, RunIdentity
 from ihbench.views import OccludedScene, open_scene
 
 if TYPE_CHECKING:
     from ihbench.body import Body
 
-CODE = "predictions"  # stands where a method's run has the version of its code
+MADE_ELSEWHERE = "predictions"  # where a method's run has been made here
 
 
 @dataclass(frozen=True)
@@ -53,11 +55,11 @@ def score_scene(request: ScoreRequest, source: DataSource, scene: str, progress:
         profile=request.protocol.profile,
         seed=0,
         body=body.content_sha(),
-        code=CODE,
+        code=f"{__version__}+{bench_code(request.protocol)}",
     )
     about = about_scene(capture, request.protocol) | {
         "device": "cpu",
-        "provenance": CODE,
+        "provenance": MADE_ELSEWHERE,
         "predictions": {
             "folder": request.folder.resolve().name,
             "pattern": found.pattern,

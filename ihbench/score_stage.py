@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench import __version__, atomic
+from ihbench import atomic
 from ihbench.calibration import ROWS, Calibration
 from ihbench.contact_sheet import SheetRow, contact_sheet, write_png
 from ihbench.metrics.eight_bit import rounded
 from ihbench.progress import Progress
 from ihbench.results import view_rows
 from ihbench.scoring import LoadedView, Predictor, Scorer
+from ihbench.source_digest import bench_code
 from ihbench.store import RunFolder
 from ihbench.views import OccludedScene
 
@@ -83,9 +84,9 @@ class ScoreStage:
         return None if self.force or not file.is_file() else atomic.read_json_lines(file)
 
     def _calibration_file(self) -> Path:
-        """Calibration rows depend on data, protocol and metrics only: they are computed once for all runs."""
+        """Calibration rows depend on data, protocol and the bench's code only: computed once for all runs."""
         identity, protocol = self.folder.identity, self.scorer.scene.protocol
-        parts = [__version__, *(identity[k] for k in ("protocol_digest", "scene", "data", "body"))]
+        parts = [bench_code(protocol), *(identity[k] for k in ("protocol_digest", "scene", "data", "body"))]
         for preset in self.scorer.presets:
             parts += [*preset.identities(protocol.regions, protocol.image.background), *preset.lacking()]
         digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]

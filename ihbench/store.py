@@ -55,7 +55,7 @@ class RunIdentity:
     profile: str
     seed: int
     body: str  # hash of the body model
-    code: str  # version of the method's code
+    code: str  # version, hash of the method's code, hash of the bench's: see `source_digest`
 
     @property
     def digest(self) -> str:

@@ -35,11 +35,13 @@ def _planned(chosen: SceneChoice, protocol: Protocol) -> dict[str, Any]:
     from ihbench.machine import cpu_model
     from ihbench.plan import absent_regions, measure_scene
     from ihbench.run_loop import configuration
+    from ihbench.source_digest import code_of
 
     config = configuration(chosen.method, chosen.profile, {})
     leave_out = registry.load("config", chosen.method).leave_out
     source = locate(protocol, chosen.data, chosen.scene)
-    earlier = earlier_runs(chosen.runs, chosen.method, protocol.name, chosen.profile, cpu_model())
+    code = code_of(protocol, chosen.method)
+    earlier = earlier_runs(chosen.runs, chosen.method, protocol.name, chosen.profile, cpu_model(), code)
     report = {
         "protocol": protocol.name,
         "profile": chosen.profile,
@@ -48,6 +50,7 @@ def _planned(chosen: SceneChoice, protocol: Protocol) -> dict[str, Any]:
         "expected_seconds_per_scene": None if earlier is None else earlier.seconds,
         "earlier_runs": 0 if earlier is None else earlier.count,
         "earlier_runs_had_other_switches": earlier is not None and not earlier.same_switches,
+        "earlier_runs_had_other_code": earlier is not None and not earlier.same_code,
         "config": asdict(config),
         "scenes": {},
     }
@@ -78,6 +81,7 @@ def _print(report: dict) -> None:
     if seconds:
         which = f"{report['earlier_runs']} earlier run{'s' * (report['earlier_runs'] > 1)} of this protocol"
         others = " with other switches" if report["earlier_runs_had_other_switches"] else ""
+        others += " by other code" if report["earlier_runs_had_other_code"] else ""
         print(f"expected: {seconds:.0f} s per scene, the median of {which} on such a processor{others}")
     else:
         print("expected: unknown, no earlier run of this protocol on such a processor to go by")

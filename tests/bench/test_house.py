@@ -29,7 +29,7 @@ def wrong_imports(room, path):
             if name.startswith("relative"):
                 yield name
         elif len(parts) > 1 and parts[1] in CONTENT and parts[1] != room:
-            yield f"{path.relative_to(ROOT)} imports {name}"
+            yield f"{path} imports {name}"
 
 
 @pytest.mark.parametrize("room", ["ihbench", *CONTENT])
@@ -40,13 +40,9 @@ def test_imports_point_one_way(room):
 
 
 def test_the_checker_sees_a_wrong_import(tmp_path):
-    bad = ROOT / "ihbench" / "bad_example_for_the_test.py"
-    assert not bad.exists()
-    try:
-        bad.write_text("from ihbench.methods.inpainthuman import avatar\n", encoding="utf-8")
-        assert list(wrong_imports("ihbench", bad))
-    finally:
-        bad.unlink()
+    bad = tmp_path / "bad.py"  # not in the room itself: a run of another process would hash it
+    bad.write_text("from ihbench.methods.inpainthuman import avatar\n", encoding="utf-8")
+    assert list(wrong_imports("ihbench", bad))
 
 
 def test_no_top_level_package_shadows_another():

@@ -253,10 +253,12 @@ def test_only_some_of_many_views_are_read(monkeypatch):
 # ---------------------------------------------------------------------------------------------- expected time
 
 
-def a_run(seconds, method="inpainthuman", profile="quick", status="done", protocol="p@1", cpu="one", **about):
+def a_run(
+    seconds, method="inpainthuman", profile="quick", status="done", protocol="p@1", cpu="one", code="1", **about
+):
     return {
         "status": status,
-        "identity": {"method": method, "profile": profile, "protocol": protocol},
+        "identity": {"method": method, "profile": profile, "protocol": protocol, "code": code},
         "about": {"total_seconds": seconds, "changed": [], "left_out": [], **about},
         "machine": {"cpu": cpu},
         "ledger": {"stages": {"fit/stage1": {"seconds": 0.5 * seconds}}} if isinstance(seconds, int) else {},
@@ -271,12 +273,14 @@ def runs_of(folder, records):
 
 
 def test_expected_seconds_are_the_median_of_finished_runs_alike(tmp_path):
-    def seconds(method="inpainthuman", protocol="p@1", profile="quick", cpu="one"):
-        found = earlier_runs(tmp_path, method, protocol, profile, cpu)
+    def seconds(method="inpainthuman", protocol="p@1", profile="quick", cpu="one", code="1"):
+        found = earlier_runs(tmp_path, method, protocol, profile, cpu, code)
+        assert found is None or found.same_code == (code == "1" or profile == "paper")
         return None if found is None else (found.seconds, found.count, found.same_switches)
 
     assert seconds() is None
-    records = [a_run(10), a_run(30), a_run(100), a_run(999, status="failed"), a_run(5, profile="paper")]
+    records = [a_run(10), a_run(30), a_run(100), a_run(999, status="failed")]
+    records += [a_run(5, profile="paper", code="2"), a_run(77, code="0"), a_run(88, code="0")]
     records += [a_run(1, method="other"), {"status": "done"}, [], a_run("soon"), a_run(None)]
     records += [a_run(2, protocol="p@1+size=64"), a_run(3, cpu="two"), a_run(4, changed=["steps=60"])]
     records += [a_run(7, cpu="three", changed=["steps=60"])]
@@ -284,7 +288,8 @@ def test_expected_seconds_are_the_median_of_finished_runs_alike(tmp_path):
     (tmp_path / "cut").mkdir()
     (tmp_path / "cut" / "run.json").write_text('{"status": "do')
     assert seconds() == (30, 3, True)
-    assert seconds(profile="paper") == (5, 1, True)
+    assert seconds(code="other") == (77, 5, True)  # none of this code: all that there are
+    assert seconds(profile="paper", code="2") == (5, 1, True)
     assert seconds(protocol="p@1+size=64") == (2, 1, True)
     assert seconds(cpu="two") == (3, 1, True)
     assert seconds(cpu="three") == (7, 1, False)
@@ -296,7 +301,7 @@ def test_what_an_omission_saves_is_its_share_of_the_stages_of_earlier_runs(tmp_p
     records[2]["ledger"]["stages"] |= {"fit/stage2": {"seconds": 40}, "fit/stage3": {"seconds": 20}}
     records.append(a_run(2, left_out=[{"field": "texels", "value": 64, "reason": ""}]))  # did less
     records[0]["about"]["left_out"] = [{"field": "never_seen", "value": None, "reason": ""}]  # a region, no work
-    earlier = earlier_runs(runs_of(tmp_path, records), "inpainthuman", "p@1", "quick", "one")
+    earlier = earlier_runs(runs_of(tmp_path, records), "inpainthuman", "p@1", "quick", "one", "1")
     stages = earlier.stages
     assert stages == {"fit/stage1": 15, "fit/stage2": 40, "fit/stage3": 20}
     found = {o.field: o.seconds(stages) for o in leave_out(QUICK, replace(moving, motion_deg=0.0, hidden_texels=0.0))}
