@@ -8,6 +8,10 @@ One image a test view, named by a pattern of the view's camera and frame. The de
 Placeholders: {scene}; {camera}, the data set's name for it; {camera_index} from 0; {frame} of the capture; {index},
 the number of the test view in the protocol's order (all frames of a camera, then the next camera). A number may be
 padded ({frame:06d}). `ihbench score --names` prints the file expected for each view.
+
+Transparent images are composited on the protocol's background. What their colours are, file formats do not say for
+sure: "straight" (the colour itself), "premultiplied" (times alpha) or "composited" (on the background already, beside
+an alpha channel). The colours of half transparent pixels rule out two of these, or the user must say it.
 """
 
 from __future__ import annotations
@@ -24,14 +28,17 @@ from numpy.typing import NDArray
 
 from ihbench import registry
 from ihbench.errors import BadInput
-from ihbench.files.pictures import read_picture
+from ihbench.files.pictures import Header, header_of, read_picture
 from ihbench.metrics.images import Color
 from ihbench.views import TestViewKey
 
 DEFAULT_PATTERNS = ("{scene}/{camera}/{frame:06d}.png", "{camera}/{frame:06d}.png")
 PLACEHOLDERS = ("scene", "camera", "camera_index", "frame", "index")
 SUFFIXES = (".png", ".jpg", ".jpeg", ".npy")
-LOSSY = (".jpg", ".jpeg")
+ALPHAS = ("straight", "premultiplied", "composited")
+ROUNDING = 2 / 255, 16 / 255  # of colours, in files with and without loss
+SOME = 0.01  # share of pixels: fewer may be colours beyond white, which renderers clip
+ENOUGH = 2000  # half transparent pixels
 
 
 @dataclass(frozen=True)
@@ -43,11 +50,12 @@ class Predictions:
     files: dict[TestViewKey, Path]
     missing: tuple[str, ...]  # paths expected below `root`, in the order of the views
     surplus: tuple[str, ...]  # image files below `root` that no view of any scene expects
+    alpha: str = "straight"  # what the colours of transparent pixels are, one of ALPHAS
 
     @property
     def digest(self) -> str:
         """Hash of the images' bytes and what they stand for: other images make another run."""
-        found = hashlib.sha256()
+        found = hashlib.sha256(b"" if self.alpha == ALPHAS[0] else self.alpha.encode())
         for key, path in self.files.items():
             found.update(f"{key.name}\n".encode())
             found.update(hashlib.sha256(path.read_bytes()).digest())
@@ -56,7 +64,7 @@ class Predictions:
     def read(self, key: TestViewKey, background: Color) -> NDArray | None:
         """The image of one view, [H, W, 3]; None where there is none. See `read_image`."""
         path = self.files.get(key)
-        return None if path is None else read_image(path, background)
+        return None if path is None else read_image(path, background, self.alpha)
 
     def notes(self) -> list[str]:
         """What a reader of the scores must know, a line each."""
@@ -65,9 +73,16 @@ class Predictions:
             found.append(f"{len(self.missing)} of {len(self.missing) + len(self.files)} predictions are missing")
         if self.surplus:
             found.append(f"{len(self.surplus)} image files in the folder match no test view")
-        lossy = sum(path.suffix.lower() in LOSSY for path in self.files.values())
-        if lossy:
-            found.append(f"{lossy} predictions are JPEG: compression error counts as the method's")
+        headers = [_header(path) for path in self.files.values() if path.suffix.lower() != ".npy"]
+        for what, number in (
+            ("are JPEG or the like: compression error counts as the method's", sum(h.lossy for h in headers)),
+            ("are grey", sum(h.grey for h in headers)),
+            ("have a palette, 256 colours at most", sum(h.palette for h in headers)),
+        ):
+            if number:
+                found.append(f"{number} predictions {what}")
+        if self.alpha != ALPHAS[0]:
+            found.append(f"colours of transparent pixels are {self.alpha}")
         return found
 
 
@@ -117,12 +132,86 @@ def expected_names(pattern: str | None, scene: str, keys: Sequence[TestViewKey])
     return [names[key] for key in keys]
 
 
-def read_image(path: Path, background: Color) -> NDArray:
+def find_alpha(files: Sequence[Path], background: Color, named: str | None = None) -> str:
+    """What the colours of the files' transparent pixels are, one of ALPHAS; "straight" where none is transparent.
+
+    Raises `BadInput` when the colours do not tell and none is `named`, and when they are not what is `named`.
+    """
+    if named is not None and named not in ALPHAS:
+        raise BadInput(f"--alpha {named!r}: {registry.nearest(named, list(ALPHAS))}")
+    against = {kind: np.zeros((2, 2)) for kind in ALPHAS[1:]}  # clear and half transparent pixels: all, in the way
+    example = None
+    for path in files:
+        is_array = path.suffix.lower() == ".npy"
+        if not is_array and not _header(path).alpha:
+            continue
+        image = _read(path)
+        if image.shape[2] not in (2, 4):
+            continue
+        tolerance = ROUNDING[not is_array and _header(path).lossy]
+        values = image / 255 if image.dtype == np.uint8 else image
+        color, share = values[..., :-1], values[..., -1:]
+        clear, half = share[..., 0] <= 0, (share[..., 0] > 0) & (share[..., 0] < 1)
+        behind = np.asarray(background)[: color.shape[2]] * (1 - share)
+        for kind, least in (("premultiplied", np.zeros(1)), ("composited", behind)):
+            beyond = ((color < least - tolerance) | (color > least + share + tolerance)).any(2)
+            against[kind] += [[some.sum(), (some & beyond).sum()] for some in (clear, half)]
+        example = example or (path if half.any() else None)
+        if named is None and against["composited"][1, 0] > ENOUGH and not _possible(against):
+            break
+    if example is None:
+        return ALPHAS[0]
+    possible = _possible(against)
+    if named is None:
+        if not possible:
+            return ALPHAS[0]
+        raise BadInput(
+            f"prediction {example}: half transparent, with colours that may be straight or {' or '.join(possible)}; "
+            f"say which with --alpha (premultiplied: times alpha; composited: on the background already)"
+        )
+    if named not in (ALPHAS[0], *possible):
+        raise BadInput(
+            f"--alpha {named}: prediction {example} and the others have colours that are not {named}; "
+            f"expected --alpha {' or '.join((ALPHAS[0], *possible))}"
+        )
+    return named
+
+
+def _possible(against: dict[str, NDArray]) -> list[str]:
+    """The kinds of alpha that the colours of all pixels but a few agree with."""
+    return [
+        kind for kind, (clear, half) in against.items() if clear[1] <= SOME * clear[0] and half[1] <= SOME * half[0]
+    ]
+
+
+def read_image(path: Path, background: Color, alpha: str = ALPHAS[0]) -> NDArray:
     """[H, W, 3]: uint8 from 8-bit files, float in [0, 1] from 16-bit PNG and float arrays (.npy).
 
-    Transparent images are composited on `background`; grey ones get three equal channels. Raises `BadInput` for what
-    cannot be read or is no image.
+    Transparent images are composited on `background`, see ALPHAS; grey ones get three equal channels. Raises
+    `BadInput` for what cannot be read or is no image.
     """
+    image = _read(path)
+    if image.shape[2] in (2, 4):
+        image = _composited(image[..., :-1], image[..., -1:], background, alpha)
+    return np.repeat(image, 3, axis=2) if image.shape[2] == 1 else np.ascontiguousarray(image)
+
+
+def _composited(color: NDArray, share: NDArray, background: Color, alpha: str) -> NDArray:
+    """[H, W, 1 or 3] colours [H, W, 1 or 3] with alpha `share` [H, W, 1] on the background."""
+    if alpha == "composited" or (color.dtype == np.uint8 and (share == 255).all()):
+        return color
+    if color.dtype == np.uint8:
+        color, share = color / 255.0, share / 255.0
+    painted = color * share if alpha == "straight" else color
+    return painted + np.asarray(background, color.dtype) * (1 - share)
+
+
+def _header(path: Path) -> Header:
+    return header_of(path, f"prediction {path}")
+
+
+def _read(path: Path) -> NDArray:
+    """[H, W, 1 to 4] as `read_image` says, with its alpha channel."""
     image = _read_array(path) if path.suffix.lower() == ".npy" else _read_picture(path)
     if image.ndim == 2:
         image = image[..., None]
@@ -130,17 +219,7 @@ def read_image(path: Path, background: Color) -> NDArray:
         raise BadInput(
             f"prediction {path}: expected an image [H, W], [H, W, 3] or [H, W, 4], got shape {image.shape}"
         )
-    if image.shape[2] in (2, 4):
-        color, alpha = image[..., :-1], image[..., -1:]
-        if image.dtype == np.uint8:
-            if (alpha == 255).all():
-                image = color
-            else:
-                color, alpha = color / 255.0, alpha / 255.0
-                image = color * alpha + np.asarray(background) * (1 - alpha)
-        else:
-            image = color * alpha + np.asarray(background, image.dtype) * (1 - alpha)
-    return np.repeat(image, 3, axis=2) if image.shape[2] == 1 else np.ascontiguousarray(image)
+    return image
 
 
 def _read_picture(path: Path) -> NDArray:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ihbench import __version__
 from ihbench.capture_digest import capture_digest
 from ihbench.data_source import DataSource
-from ihbench.predictions import Predictions, find_predictions
+from ihbench.prediction_doubts import Doubts
+from ihbench.predictions import Predictions, find_alpha, find_predictions
 from ihbench.progress import Progress
 from ihbench.protocol import Protocol
 from ihbench.recorded_run import RecordedRun, about_scene, recorded
@@ -37,6 +38,7 @@ class ScoreRequest:
     runs: Path = Path("runs")
     body: Path | None = None  # SMPL model file, for real data
     force: bool = False
+    alpha: str | None = None  # what the colours of transparent pixels are, see `ihbench.predictions`
 
 
 def score_scene(request: ScoreRequest, source: DataSource, scene: str, progress: Progress) -> RunResult:
@@ -44,6 +46,8 @@ def score_scene(request: ScoreRequest, source: DataSource, scene: str, progress:
     capture, body = source.open(scene, request.body, progress)
     opened = open_scene(capture, request.protocol)
     found = find_predictions(request.folder, scene, opened.test_keys, request.pattern, source.scenes)
+    background = request.protocol.image.background
+    found = replace(found, alpha=find_alpha(list(found.files.values()), background, request.alpha))
     identity = RunIdentity(
         protocol=request.protocol.name,
         protocol_digest=request.protocol.digest,
@@ -65,6 +69,7 @@ def score_scene(request: ScoreRequest, source: DataSource, scene: str, progress:
             "pattern": found.pattern,
             "missing": list(found.missing),
             "surplus": list(found.surplus),
+            "alpha": found.alpha,
             "notes": found.notes(),
         },
         "changed": [],
@@ -77,6 +82,7 @@ def score_scene(request: ScoreRequest, source: DataSource, scene: str, progress:
         request.force,
         lambda folder: _ScoreRun(request, found, opened, body, folder, progress),
     )
+    about["predictions"]["doubts"] = result.record["about"]["predictions"].get("doubts", [])
     if result.record["about"]["predictions"] == about["predictions"]:
         return result
     folder = RunFolder.open(result.folder)  # the same images were scored before, beside other stray files
@@ -109,6 +115,13 @@ class _ScoreRun(RecordedRun):
         with self.ledger.stage("score"):
             stage = ScoreStage(scorer, self.body, self.folder, self.request.runs, self.progress, self.request.force)
             background = self.scene.protocol.image.background
-            stage.run(self.request.name, lambda loaded: self.found.read(loaded.key, background), threaded=True)
+            doubts = Doubts(background)
+            stage.run(
+                self.request.name,
+                lambda loaded: self.found.read(loaded.key, background),
+                threaded=True,
+                look=doubts.look,
+            )
+            self.folder.record["about"]["predictions"]["doubts"] = doubts.notes()
         self.describe(hidden_share=self.scene.hiding.hidden_share(), fit_seconds=None)
         self.folder.set_status("done", ledger=self.ledger)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -39,8 +40,17 @@ class ScoreStage:
     progress: Progress
     force: bool = False  # compute calibration rows again
 
-    def run(self, name: str, predict: Predictor, threaded: bool = False) -> None:
-        """Write scores.jsonl, calibration.jsonl, renders/ and contact_sheet.png. `threaded`: see `Scorer.scored`."""
+    def run(
+        self,
+        name: str,
+        predict: Predictor,
+        threaded: bool = False,
+        look: Callable[[LoadedView, NDArray], None] | None = None,
+    ) -> None:
+        """Write scores.jsonl, calibration.jsonl, renders/ and contact_sheet.png. `threaded`: see `Scorer.scored`.
+
+        `look` is shown every image, on other threads.
+        """
         scene = self.scorer.scene
         rows, kept = {name: predict}, self._kept_calibration()
         if kept is None:
@@ -51,6 +61,8 @@ class ScoreStage:
             image = images[name]
             if image is not None:
                 write_png(render_path(self.folder, loaded), _shown(image))
+                if look is not None:
+                    look(loaded, image)
 
         results = {row: [] for row in rows}
         with self.progress.task("scoring", len(scene.test_keys)) as task:

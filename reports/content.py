@@ -234,7 +234,8 @@ def _remarks(runs: list[RunResult]) -> list[str]:
             omitted.setdefault((labels[id(run)], what), []).append(run.scene)
         notes += [
             f"{run.method} on {run.scene}: {note}"
-            for note in run.record["about"].get("predictions", {}).get("notes", ())
+            for kind in ("notes", "doubts")
+            for note in run.record["about"].get("predictions", {}).get(kind, ())
         ]
     for (label, what), scenes in omitted.items():
         notes.append(f"left out, {label} on {', '.join(dict.fromkeys(scenes))}: {what}")

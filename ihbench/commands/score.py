@@ -27,6 +27,9 @@ class ScoreOptions(ProtocolChanges):
     {frame:06d}. By default {scene}/{camera}/{frame:06d}.png or {camera}/{frame:06d}.png, whichever finds more."""
     name: str | None = None
     """The row's name in tables; by default the folder's."""
+    alpha: str | None = None
+    """What colours beside an alpha channel are: straight, premultiplied (times alpha) or composited (on the
+    background already). Needed only where they do not tell."""
     names: bool = False
     """Print the file expected for each test view and end."""
     scene: tuple[str, ...] = ()
@@ -67,7 +70,9 @@ def main(argv: list[str]) -> int:
     if name in ROWS or not name.strip():
         raise BadInput(f"--name {name!r}: is a calibration row's name; choose another with --name")
     progress = Progress()
-    request = ScoreRequest(protocol, chosen.predictions, name, chosen.pattern, chosen.runs, chosen.body, chosen.force)
+    request = ScoreRequest(
+        protocol, chosen.predictions, name, chosen.pattern, chosen.runs, chosen.body, chosen.force, chosen.alpha
+    )
     results = []
     for scene in chosen.scene or _with_folders(source.scenes, chosen.predictions, chosen.pattern):
         progress.say(f"{protocol.name} {scene}: predictions {name}, {protocol.profile} profile")
@@ -79,7 +84,7 @@ def main(argv: list[str]) -> int:
         for kind in ("missing", "surplus"):
             for path in found[kind]:
                 progress.say(f"{result.scene}: {kind}: {path}")
-        for note in found["notes"]:
+        for note in [*found["notes"], *found["doubts"]]:
             progress.say(f"{result.scene}: {note}")
     if chosen.json:
         told = as_json(results)

@@ -71,10 +71,33 @@ class Picture:
         return None if alpha is None or (alpha == self.white).all() else alpha
 
 
+@dataclass(frozen=True)
+class Header:
+    """What a picture file says before it is decoded."""
+
+    size: tuple[int, int]  # px, width and height
+    alpha: bool  # whether some pixels may be transparent
+    grey: bool
+    palette: bool
+    lossy: bool
+
+
+def header_of(path: Path, name: str = "") -> Header:
+    """Raises `BadInput` for what is no picture. `name` stands in messages for the path."""
+    with _opened(path, name or str(path)) as picture:
+        mode = picture.mode
+        return Header(
+            picture.size,
+            mode in ("LA", "La", "PA", "RGBA") or "transparency" in picture.info,
+            mode in ("1", "L", "LA", "La") or mode.startswith("I"),
+            mode in ("P", "PA"),
+            _lossy(picture, path),
+        )
+
+
 def size_of(path: Path) -> tuple[int, int]:
     """(width, height) px by the header. Raises `BadInput`."""
-    with _opened(path, str(path)) as picture:
-        return picture.size
+    return header_of(path).size
 
 
 def read_rgb(path: Path) -> NDArray[np.uint8]:
@@ -150,7 +173,7 @@ def read_picture(path: Path, name: str = "", colours_matter: bool = True) -> Pic
         if frames > 1:
             raise BadInput(f"{name}: holds {frames} pictures; expected one, save each as a file of its own")
         _refuse(picture, header, name, colours_matter)
-        lossy = picture.format in ("JPEG", "MPO") or (picture.format == "WEBP" and _lossy_webp(path))
+        lossy = _lossy(picture, path)
         if picture.mode in ("RGB", "RGBA", "LA") and any(";16" in tile for tile in tiles):
             return Picture(_deep(path, name, tiles), lossy)
         labels = np.array(picture) if picture.mode == "P" else None
@@ -321,6 +344,8 @@ def _labelled(picture: Picture, path: Path) -> NDArray[np.bool_]:
     return picture.labels != 0
 
 
-def _lossy_webp(path: Path) -> bool:
+def _lossy(picture: Image.Image, path: Path) -> bool:
+    if picture.format != "WEBP":
+        return picture.format in ("JPEG", "MPO")
     with open(path, "rb") as file:
         return b"VP8 " in file.read(2**16)

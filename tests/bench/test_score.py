@@ -9,7 +9,7 @@ from PIL import Image
 
 from ihbench import atomic
 from ihbench.errors import BadInput
-from ihbench.predictions import find_predictions, read_image
+from ihbench.predictions import find_alpha, find_predictions, read_image
 from ihbench.run_loop import load_scene
 from ihbench.views import TestViewKey
 
@@ -150,6 +150,89 @@ def test_transparent_images_are_composited_and_grey_ones_coloured(tmp_path):
     np.testing.assert_allclose(image[1, 1], [1.0, 0.5, 0.0])
     Image.fromarray(np.full((2, 2), 7, np.uint8)).save(tmp_path / "g.png")
     assert (read_image(tmp_path / "g.png", WHITE) == np.full((2, 2, 3), 7, np.uint8)).all()
+
+
+HALF = np.random.default_rng(0).integers(20, 236, (30, 30))  # alpha
+BRIGHT = np.random.default_rng(1).integers(120, 256, (30, 30, 3))
+
+
+def transparent(kind, background=255):
+    """RGBA of bright colours of every transparency, with a frame that is clear."""
+    share = HALF[..., None] / 255
+    colour = {"straight": BRIGHT, "premultiplied": BRIGHT * share}.get(
+        kind, BRIGHT * share + background * (1 - share)
+    )
+    rgba = np.concatenate([np.rint(colour), HALF[..., None]], 2).astype(np.uint8)
+    rgba[0] = (*([0, 0, 0] if kind != "composited" else [background] * 3), 0)
+    return rgba
+
+
+@pytest.mark.parametrize("ending", ["png", "npy"])
+@pytest.mark.parametrize("kind", ["straight", "premultiplied", "composited"])
+def test_what_the_colours_beside_alpha_are_is_proven_or_asked(tmp_path, kind, ending):
+    path, rgba = tmp_path / f"a.{ending}", transparent(kind)
+    np.save(path, rgba / np.float32(255)) if ending == "npy" else Image.fromarray(rgba).save(path)
+    if kind == "straight":
+        assert find_alpha([path], WHITE) == find_alpha([path], WHITE, "straight") == kind
+        for other in ("premultiplied", "composited"):
+            with pytest.raises(BadInput, match=f"--alpha {other}.*not {other}; expected --alpha straight$"):
+                find_alpha([path], WHITE, other)
+    else:
+        with pytest.raises(BadInput, match=f"may be straight or {kind}; say which with --alpha"):
+            find_alpha([path], WHITE)
+        assert find_alpha([path], WHITE, kind) == kind
+    image = read_image(path, WHITE, kind)
+    share = HALF[1:, :, None] / 255
+    expected = BRIGHT[1:] / 255 * share + 1 - share
+    np.testing.assert_allclose((image / (255 if image.dtype == np.uint8 else 1))[1:], expected, atol=0.003)
+    assert (image[0] == image[0].max()).all()
+    with pytest.raises(BadInput, match="did you mean 'straight'"):
+        find_alpha([path], WHITE, "strait")
+
+
+def test_alpha_of_nothing_or_all_needs_no_word(tmp_path):
+    rgba = np.zeros((4, 4, 4), np.uint8)
+    rgba[1:3, 1:3] = 90, 60, 30, 255
+    Image.fromarray(rgba).save(tmp_path / "a.png")
+    Image.fromarray(rgba[..., :3]).save(tmp_path / "b.png")
+    assert find_alpha([tmp_path / "a.png", tmp_path / "b.png"], WHITE) == "straight"
+
+
+def test_premultiplied_truths_are_perfect_when_that_is_said(bench, truths):
+    for path in truths.rglob("*.png"):
+        white = np.asarray(Image.open(path)).astype(int)
+        alpha = np.where((white == 255).all(2, keepdims=True), 0, 200)  # white shows through
+        colour = white - (255 - alpha)
+        alpha = np.where((colour < 0).any(2, keepdims=True), 255, alpha)
+        rgba = np.concatenate([np.where(alpha == 255, white, colour), alpha], 2)
+        Image.fromarray(rgba.clip(0, 255).astype(np.uint8)).save(path)
+    outcome = score(bench, truths)
+    assert outcome.status == 2
+    assert "say which with --alpha" in outcome.err
+    assert not bench.folders()
+    outcome = score(bench, truths, "--alpha", "premultiplied", "--json")
+    assert outcome.status == 0, outcome.err
+    (run,) = json.loads(outcome.out)["runs"]
+    assert float(run["scores"]["mine"]["psnr/pooled/range1/full/v1"]) > 60
+    assert run["predictions"]["alpha"] == "premultiplied"
+    assert "colours of transparent pixels are premultiplied" in outcome.err
+    straight = score(bench, truths, "--alpha", "straight", "--json")
+    (other,) = json.loads(straight.out)["runs"]
+    assert other["folder"] != run["folder"]
+    assert float(other["scores"]["mine"]["psnr/pooled/range1/full/v1"]) < 40
+
+
+def test_doubts_and_kinds_of_files_are_said(bench, truths):
+    for path in truths.rglob("*.png"):
+        Image.fromarray(np.asarray(Image.open(path))[..., ::-1].copy()).save(path, "JPEG", quality=95)
+    outcome = score(bench, truths)
+    assert outcome.status == 0, outcome.err
+    for words in ("are JPEG or the like", "red and blue exchanged: are they BGR?"):
+        assert words in outcome.err
+        assert words in outcome.out
+    again = score(bench, truths)
+    assert "are they BGR?" in again.err
+    assert len(bench.folders()) == 1
 
 
 def test_sixteen_bits_and_arrays_keep_their_precision(tmp_path):

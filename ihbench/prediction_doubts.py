@@ -1,0 +1,165 @@
+"""What makes a folder of predictions look mistaken rather than bad: things that a score alone would not show.
+
+Each is said only where a simple change makes nearly all predictions fit their truth far better: red and blue
+exchanged, mirrored, linear light, moved by a part of a pixel, the truth of other frames; and a background that is not
+the protocol's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench.metrics.images import Color, bounds, grown
+from ihbench.scoring import LoadedView
+
+FAR_BETTER = 0.5  # of the squared error, at most
+MOST = 0.75  # share of the views that must agree
+MOVED = 0.25  # px
+SAME = 1.5 / 255  # of a background's colour
+LEAST_ERROR = 1e-5  # mean squared: closer than 50 dB nothing is doubted
+LEAST_BACKGROUND = 100  # px
+MARGIN = 4  # px around a person
+SMALL = 32  # px, side of the pictures by which views are compared with each other
+MOST_VIEWS = 1000  # that are compared with each other
+
+
+def _encode(linear: NDArray) -> NDArray:
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
+
+
+def _decode(srgb: NDArray) -> NDArray:
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((np.maximum(srgb, 0.04045) + 0.055) / 1.055) ** 2.4)
+
+
+CHANGES: dict[str, Callable[[NDArray], NDArray]] = {  # what would be wrong -> what undoes it, on [H, W, 3]
+    "with red and blue exchanged: are they BGR?": lambda image: image[..., ::-1],
+    "mirrored left to right": lambda image: image[:, ::-1],
+    "upside down": lambda image: image[::-1],
+    "encoded as sRGB: are they linear light?": _encode,
+    "decoded from sRGB: were they encoded twice?": _decode,
+}
+
+
+@dataclass(frozen=True)
+class _Look:
+    name: str
+    error: float  # mean squared, in the rectangle of the person
+    changed: tuple[float, ...]  # the same after each of CHANGES
+    moved: NDArray[np.float64]  # [2] px by which it lies right of and below the truth
+    background: NDArray[np.float64] | None  # [3] in [0, 1], median where the truth shows only background
+    truth: NDArray[np.float32]  # [3 * SMALL * SMALL]
+    prediction: NDArray[np.float32]  # the same
+
+
+class Doubts:
+    """Collects predictions beside their truths. `look` may be called from any thread."""
+
+    def __init__(self, background: Color):
+        self._background = np.asarray(background, np.float64)
+        self._looks: dict[int, _Look] = {}
+
+    def look(self, loaded: LoadedView, image: NDArray) -> None:
+        """Take in the prediction [H, W, 3] (uint8, or float in [0, 1]) of a view."""
+        truth = loaded.view.image
+        if image.shape != truth.shape:
+            return
+        image = np.nan_to_num(image / np.float32(255) if image.dtype == np.uint8 else image.astype(np.float32))
+        image = np.clip(image, 0, 1)
+        person = bounds(loaded.view.silhouette) or (slice(0, truth.shape[0]), slice(0, truth.shape[1]))
+        rows, columns = grown(person, MARGIN, truth.shape)
+        part = truth[rows, columns]
+
+        def error(changed: NDArray) -> float:
+            return float(np.square(changed[rows, columns] - part).mean())
+
+        behind = (np.abs(truth - self._background) < SAME / 2).all(2)
+        self._looks[loaded.index] = _Look(
+            loaded.key.name,
+            error(image),
+            tuple(error(change(image)) for change in CHANGES.values()),
+            _moved(image[rows, columns].mean(2), part.mean(2)),
+            np.median(image[behind], 0).astype(np.float64) if behind.sum() >= LEAST_BACKGROUND else None,
+            _small(truth),
+            _small(image),
+        )
+
+    def notes(self) -> list[str]:
+        """A line for each thing that nearly all predictions have in common."""
+        looks = [look for _, look in sorted(self._looks.items())]
+        doubted = [look for look in looks if look.error > LEAST_ERROR]
+        notes = []
+        seen = [look.background for look in looks if look.background is not None]
+        others = [not (np.abs(colour - self._background) <= 2 * SAME).all() for colour in seen]
+        if seen and np.mean(others) >= MOST:
+            said, meant = (
+                ", ".join(f"{value * 255:.0f}" for value in colour)
+                for colour in (np.median(np.stack(seen), 0), self._background)
+            )
+            notes = [f"predictions have the background ({said}), the protocol's is ({meant})"]
+        if doubted and len(doubted) >= MOST * len(looks):
+            likely = [*_changed(doubted), *_exchanged(doubted, looks)]
+            if likely:
+                notes.append(min(likely)[1])
+            elif not notes:
+                notes = _shifted(doubted)
+        return notes
+
+
+def _changed(looks: list[_Look]) -> Iterator[tuple[float, str]]:
+    """(share of the error that is left, what it would mean) of each change that helps nearly everywhere."""
+    errors = np.array([[look.error, *look.changed] for look in looks])  # [n, 1 + changes]
+    better = (errors[:, 1:] < FAR_BETTER * errors[:, :1]).mean(0)
+    left = errors.sum(0)[1:] / errors.sum(0)[0]
+    for k, what in enumerate(CHANGES):
+        if better[k] >= MOST:
+            yield float(left[k]), f"predictions fit far better {what}"
+
+
+def _exchanged(doubted: list[_Look], looks: list[_Look]) -> Iterator[tuple[float, str]]:
+    """The same, where predictions fit the truths of other views."""
+    looks = looks[:MOST_VIEWS]
+    truths = np.stack([look.truth for look in looks])
+    own, nearest, pairs = 0.0, 0.0, []
+    for look in doubted[:MOST_VIEWS]:
+        errors = np.square(truths - look.prediction).mean(1)
+        mine = float(np.square(look.truth - look.prediction).mean())
+        own, nearest = own + mine, nearest + float(errors.min())
+        if errors.min() < FAR_BETTER**2 * mine:
+            pairs.append((look.name, looks[int(errors.argmin())].name))
+    if len(pairs) >= MOST * len(looks):
+        name, other = pairs[0]
+        yield (
+            nearest / own,
+            f"{len(pairs)} predictions fit the truth of another view far better than their own ({name} that of "
+            f"{other}): are frames or cameras numbered otherwise?",
+        )
+
+
+def _shifted(looks: list[_Look]) -> list[str]:
+    moved = np.stack([look.moved for look in looks])
+    middle = np.median(moved, 0)
+    if np.abs(middle).max() <= MOVED or (np.abs(moved - middle) <= MOVED).all(1).mean() < MOST:
+        return []
+    return [
+        f"predictions lie {middle[0]:+.1f} px right of and {middle[1]:+.1f} px below the truth: is a pixel's centre "
+        f"elsewhere? (test_views.json says where)"
+    ]
+
+
+def _moved(image: NDArray, truth: NDArray) -> NDArray[np.float64]:
+    """[2] the least-squares shift (right, down) of one grey image [H, W] against another; 0 where nothing tells."""
+    if min(truth.shape) < 2:
+        return np.zeros(2)
+    down, right = np.gradient((image + truth) / 2)
+    slopes = np.stack([right.ravel(), down.ravel()], 1).astype(np.float64)
+    return np.linalg.lstsq(slopes.T @ slopes, slopes.T @ (truth - image).ravel().astype(np.float64), rcond=1e-6)[0]
+
+
+def _small(image: NDArray) -> NDArray[np.float32]:
+    import cv2
+
+    return np.asarray(cv2.resize(image.astype(np.float32), (SMALL, SMALL), interpolation=cv2.INTER_AREA)).ravel()
