@@ -15,6 +15,7 @@ class CaptureFolder:
 
     n_frames: int
     camera_ids: tuple[str, ...]
+    visible_masks: bool = False
 
     def __init__(self, folder: Path, name: str, body: Body | None = None, root: Path | None = None):
         """`root` holds the stand-in's mark, the folder's parent by default. Raises `BadInput` for a body of another

@@ -55,6 +55,7 @@ class OneCameraCapture(CaptureFolder, ABC):
     """A person before one fixed camera, one image and one visible mask a frame. Keeps no images."""
 
     dataset = "ocmotion"
+    visible_masks = True
     variant: str
     frame_names: tuple[str, ...]
     _K: Array  # [3, 3] px, OpenCV's

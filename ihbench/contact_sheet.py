@@ -22,6 +22,7 @@ class SheetRow:
     training: NDArray[np.uint8]  # [H, W, 3] an occluded training image of about the same moment
     truth: NDArray[np.float32]  # [H, W, 3] in [0, 1]
     prediction: NDArray[np.float32]  # [H, W, 3] in [0, 1]
+    hidden: NDArray[np.bool_] | None = None  # [H, W] where the truth is not known: drawn grey, no error
 
 
 def error_image(prediction: NDArray[np.float32], truth: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -39,7 +40,10 @@ def contact_sheet(rows: Sequence[SheetRow], title: str, zoom: int = 1) -> NDArra
 
     cells = []
     for row in rows:
-        images = (row.training, _to_8bit(row.truth), _to_8bit(row.prediction), error_image(row.prediction, row.truth))
+        truth, error = _to_8bit(row.truth), error_image(row.prediction, row.truth)
+        if row.hidden is not None:
+            truth[row.hidden] = error[row.hidden] = GREY
+        images = (row.training, truth, _to_8bit(row.prediction), error)
         window = _window(row)
         cut = [images[0][_window_of(row.training)]] + [image[window] for image in images[1:]]
         cells.append([image.repeat(zoom, 0).repeat(zoom, 1) for image in cut])

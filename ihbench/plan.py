@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera
-from ihbench.occlusion import OcclusionPlan, apply_rule
+from ihbench.occlusion import OcclusionPlan, apply_rule, withheld
 from ihbench.protocol import Protocol
 from ihbench.scene import BodyPose, Capture, MaskState
 from ihbench.visibility import Visibility, texel_visibility
@@ -53,7 +53,7 @@ class SceneMeasure:
     training_views: int
     covered_views: int
     test_views: int
-    hidden_share: float  # of the pooled person pixels in covered frames
+    hidden_share: float  # of the pooled person pixels in covered frames; see `OcclusionPlan.hidden_share`
     visible_texels: float  # shares of the body's texels
     hidden_texels: float
     never_seen_texels: float
@@ -62,6 +62,7 @@ class SceneMeasure:
     pixel_mm: float  # body millimetres per pixel of the protocol's image, median over views
     surface_mm: float  # side of a square of the body's area, mm: texel_mm(R) follows from it
     occlusion: dict[str, Any]
+    in_scene: bool = False  # the occluder stands in the scene: test images are occluded, too
 
     def texel_mm(self, resolution: int) -> float:
         """Mean side of one texel of a UV map of this resolution on the body, mm."""
@@ -106,17 +107,22 @@ def measure_scene(capture: Capture, protocol: Protocol, body: Body) -> SceneMeas
         pixel_mm=1000 * depth / focal,
         surface_mm=1000 * float(np.sqrt(area / filled)),
         occlusion={"rule": hiding.occlusion.rule, **hiding.occlusion.record},
+        in_scene=hiding.in_scene,
     )
 
 
 def absent_regions(measure: SceneMeasure, regions: tuple[str, ...]) -> list[Omission]:
-    """Regions of the protocol that hold nothing in this scene."""
+    """Regions of the protocol that hold nothing in this scene, or whose truth is not known."""
     shares = {"hidden": measure.hidden_texels, "never_seen": measure.never_seen_texels}
     reasons = {
         "hidden": "every texel that faced the training camera was also seen un-occluded",
         "never_seen": "every texel faced the training camera at least once",
     }
-    return [Omission(r, None, reasons[r]) for r in regions if r in shares and shares[r] == 0]
+    unknowable = withheld(regions) if measure.in_scene else {}
+    return [
+        *(Omission(region, None, reason) for region, reason in unknowable.items()),
+        *(Omission(r, None, reasons[r]) for r in regions if r in shares and shares[r] == 0),
+    ]
 
 
 def _share(seen: Visibility, what: str) -> float:

@@ -131,7 +131,8 @@ def _write(
         "body": body.content_sha(),
         "occlusion": {"rule": scene.hiding.occlusion.rule, **scene.hiding.occlusion.record},
         "masks": f"visible person; {UNKNOWN_FOLDER}/ shows what is hidden: person or background, nobody knows",
-        "body_poses": "as the data set ships them, fitted to un-occluded images",
+        "body_poses": "as the data set ships them, "
+        + ("whatever they were fitted to" if scene.hiding.in_scene else "fitted to un-occluded images"),
         "train": [
             {
                 "number": number,

@@ -62,6 +62,11 @@ class OcclusionRule:
     covers_of: str  # sampled | raw
     strips: dict[str, tuple[int, int]]  # subject -> (mid, width)
     seed: int = 0  # of rules that draw something
+    in_scene: bool = False  # the occluder stands in the scene: all frames are covered, test images are occluded, too
+
+    def of(self, subject: str) -> str:
+        """The rule for one subject."""
+        return self.unlisted if self.rule == "fixed-strip" and subject not in self.strips else self.rule
 
 
 @dataclass(frozen=True)
@@ -121,27 +126,45 @@ class Protocol:
         """The same protocol under another occlusion; its digest differs, so numbers never mix.
 
         `fraction` is what the rule aims at, `covers` the share of the training frames that are covered. Published
-        strips have no fraction: asked for one, `fixed-strip` becomes the rule for subjects without a strip. Raises
-        `BadInput` for shares outside [0, 1].
+        strips have no fraction: asked for one, `fixed-strip` becomes the rule for subjects without a strip. An
+        occluder that stands in the scene covers every frame. Raises `BadInput` for shares outside [0, 1], and for
+        those that the rule does not have.
         """
         for name, share in (("fraction", fraction), ("covers", covers)):
             if share is not None and not 0 <= share <= 1:
                 raise BadInput(f"--occlusion.{name} {share:g}: expected a share from 0 to 1")
-        occlusion = dict(self.content["occlusion"])
+        occlusion = {key: value for key, value in self.content["occlusion"].items() if key != "in_scene"}
         if fraction is not None and rule is None and occlusion["rule"] == "fixed-strip":
             rule = occlusion["unlisted"]
-        changed = {"rule": rule, "fraction": fraction, "covers": covers}
         if rule is not None:
             occlusion |= {"rule": rule, "unlisted": rule}
+        if fraction is not None and not _trait(occlusion["rule"], "takes_fraction", True):
+            raise BadInput(
+                f"--occlusion.fraction {fraction:g}: rule {occlusion['rule']!r} hides what it hides, whatever the "
+                "fraction; leave it out, or name another --occlusion.rule"
+            )
+        if _trait(occlusion["rule"], "in_scene", False):
+            if covers not in (None, 1):
+                raise BadInput(
+                    f"--occlusion.covers {covers:g}: the occluder of rule {occlusion['rule']!r} stands in the scene "
+                    "and covers every frame; leave it out, or name a rule that draws an occluder"
+                )
+            occlusion["covers"], covers = {**occlusion["covers"], "fraction": 1.0}, None
         if fraction is not None:
             occlusion["fraction"] = float(fraction)
         if covers is not None:
             occlusion["covers"] = {**occlusion["covers"], "fraction": float(covers)}
+        changed = {"rule": rule, "fraction": fraction, "covers": covers}
         told = ",".join(
             str(value) if key == "rule" else f"{key}={value:g}" for key, value in changed.items() if value is not None
         )
-        replaced = _build({**self.content, "occlusion": occlusion}, self.profile)
-        return replace(replaced, version=f"{self.version}+occlusion={told}") if told else self
+        if not told:
+            return self
+        try:
+            replaced = _build({**self.content, "occlusion": _settled(occlusion)}, self.profile)
+        except ValueError as error:
+            raise BadInput(f"--occlusion.rule {rule}: {error}") from error
+        return replace(replaced, version=f"{self.version}+occlusion={told}")
 
     def with_frames(self, train: str | None = None, test: str | None = None) -> Protocol:
         """The same protocol with other frames, each "START:STOP:STEP" as in a Python slice; its digest differs.
@@ -235,7 +258,7 @@ def read_protocol(path: Path, profile: str = "quick") -> Protocol:
         )
     _merge(content, profiles[profile], path)
     try:
-        return _build(content, profile)
+        return _build({**content, "occlusion": _settled(content["occlusion"])}, profile)
     except KeyError as error:
         raise BadInput(f"protocol file {path}: key {error.args[0]!r} is missing") from error
     except (TypeError, ValueError) as error:
@@ -264,6 +287,33 @@ def _one_of(value: str, known: tuple[str, ...], what: str) -> str:
     if value not in known:
         raise ValueError(f"{what} is {value!r}, expected one of {', '.join(known)}")
     return value
+
+
+def _trait(rule: str, name: str, default: bool) -> bool:
+    """What a registered occlusion rule says of itself; see `ihbench.occlusion.occluder`."""
+    return bool(getattr(registry.load("occlusion", rule), name, default))
+
+
+def _settled(occlusion: dict[str, Any]) -> dict[str, Any]:
+    """The occlusion's table with `in_scene = true` where the rule says so: it changes what the numbers mean."""
+    rules = {occlusion["rule"], *([occlusion["unlisted"]] if occlusion["rule"] == "fixed-strip" else [])}
+    standing = {rule for rule in rules if _trait(rule, "in_scene", False)}
+    settled = {key: value for key, value in occlusion.items() if key != "in_scene"}
+    if standing and standing != rules:
+        raise ValueError(
+            f"occlusion.unlisted is {occlusion['unlisted']!r}, whose occluder stands in the scene, but "
+            f"that of {occlusion['rule']!r} is drawn; expected one kind in a protocol"
+        )
+    if not standing:
+        if occlusion.get("in_scene"):
+            raise ValueError(f"occlusion.in_scene is true, but rule {occlusion['rule']!r} draws its occluder")
+        return settled
+    if occlusion["covers"]["fraction"] != 1:
+        raise ValueError(
+            f"occlusion.covers.fraction is {occlusion['covers']['fraction']}, but the occluder of rule "
+            f"{occlusion['rule']!r} stands in the scene and covers every frame; expected 1.0"
+        )
+    return settled | {"in_scene": True}
 
 
 def _slice(text: str, flag: str) -> dict[str, Any]:
@@ -308,6 +358,11 @@ def _build(c: dict[str, Any], profile: str) -> Protocol:
     if not 0 <= share <= 1 or not 0 <= occlusion["fraction"] <= 1:
         raise ValueError("occlusion.covers.fraction and occlusion.fraction must lie in [0, 1]")
     regions = tuple(_one_of(r, REGIONS, "a region") for r in metrics["regions"])
+    if occlusion.get("in_scene") and metrics["headline"] in ("full", "box"):
+        raise ValueError(
+            f"metrics.headline is {metrics['headline']!r}, which has no number where the occluder stands in test "
+            "images; expected another region, for example body"
+        )
     return Protocol(
         id=c["id"],
         version=c["version"],
@@ -339,6 +394,7 @@ def _build(c: dict[str, Any], profile: str) -> Protocol:
             covers_of=_one_of(occlusion["covers"]["of"], ("sampled", "raw"), "occlusion.covers.of"),
             strips={k: (int(v[0]), int(v[1])) for k, v in occlusion.get("strips", {}).items()},
             seed=occlusion.get("seed", 0),
+            in_scene=occlusion.get("in_scene", False),
         ),
         image=ImageRule(
             size=image["size"],

@@ -1,6 +1,7 @@
 """Regions of a test view: where a number is taken.
 
-`visible`, `hidden` and `never_seen` partition `body` by what training showed of the surface that a pixel shows.
+`visible`, `hidden` and `never_seen` partition `body` by what training showed of the surface that a pixel shows. What
+nobody knows of a test view (`TestView.hidden`) is in no region.
 """
 
 from __future__ import annotations
@@ -65,11 +66,12 @@ class SurfaceMap:
         for name in names:
             padding = re.fullmatch(r"box\+([0-9.]+)", name)
             if padding:
-                found[name] = projected_box(vertices, view.camera, float(padding[1]))
+                region = projected_box(vertices, view.camera, float(padding[1]))
             elif name in every:
-                found[name] = every[name]()
+                region = every[name]()
             else:
                 raise ValueError(f"region {name!r}: expected one of {', '.join(every)}, or box+METRES")
+            found[name] = region if view.hidden is None else region & ~view.hidden
         return found
 
     def _surface_labels(self, vertices: NDArray[np.float64], view: TestView) -> NDArray[np.uint8]:

@@ -72,4 +72,10 @@ def reopen_scene(folder: Path, data: Path | None, body: Path | None) -> tuple[Oc
         raise BadInput(
             f"{folder}: the data of {capture.name} are not those that the run was made on; name its --data"
         )
-    return open_scene(capture, protocol), reopen_body(folder, data, body)
+    scene = open_scene(capture, protocol)
+    if scene.hiding.in_scene != protocol.occlusion.in_scene:
+        raise BadInput(
+            f"{folder}: was scored as if its occluder, which stands in the scene, hid nothing of the test images; "
+            "run it again"
+        )
+    return scene, reopen_body(folder, data, body)

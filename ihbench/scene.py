@@ -66,11 +66,12 @@ class TestView:
     __test__ = False  # pytest: not a test class
 
     image: NDArray[np.float32]  # [H, W, 3] RGB in [0, 1], un-occluded, on the protocol's background
-    silhouette: NDArray[np.bool_]  # [H, W] the true, complete silhouette
+    silhouette: NDArray[np.bool_]  # [H, W] the true silhouette, complete but for `hidden`
     camera: Camera
     body_pose: BodyPose
     frame: int
     camera_id: str
+    hidden: NDArray[np.bool_] | None = None  # [H, W] nobody knows what is there: in no region; None for nowhere
 
 
 @dataclass(frozen=True)
@@ -97,6 +98,7 @@ class Capture(Protocol):
     body: str  # "smpl", or "procedural" for the bench's own body
     n_frames: int
     camera_ids: tuple[str, ...]
+    visible_masks: bool  # silhouettes are of visible pixels: what stands before the person is not in them
 
     @property
     def model(self) -> Body:

@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 
 from ihbench.errors import BadInput
 from ihbench.machine import usable_cores
+from ihbench.metrics.eight_bit import rounded
 from ihbench.metrics.evaluate import Preset, evaluate, find_preset
 from ihbench.metrics.identity import Score
+from ihbench.occlusion import withheld
 from ihbench.regions import SurfaceMap
 from ihbench.scene import TestView
 from ihbench.threads import single_threaded_libraries
@@ -85,6 +87,11 @@ class Scorer:
         return cls(scene, SurfaceMap.build(body, texels, visibility), texels, visibility, found)
 
     @cached_property
+    def withheld(self) -> dict[str, str]:
+        """Regions without numbers in this scene, each with the reason."""
+        return withheld(self.region_names) if self.scene.hiding.in_scene else {}
+
+    @cached_property
     def region_names(self) -> tuple[str, ...]:
         """The protocol's regions, and those that the presets take or need beside them."""
         names = list(self.scene.protocol.regions)
@@ -98,7 +105,8 @@ class Scorer:
         return LoadedView(index, self.scene.test_keys[index], view, regions)
 
     def score(self, loaded: LoadedView, image: NDArray | None, slow: bool = True) -> ViewScores:
-        """Score one image. Raises `BadInput` when it has another size than the test view."""
+        """Score one image; pixels whose truth nobody knows count as right, also where windows reach them. Raises
+        `BadInput` when it has another size than the test view."""
         protocol = self.scene.protocol
         background = protocol.image.background
         scores: dict[str, Score] = {}
@@ -106,12 +114,21 @@ class Scorer:
             raise BadInput(
                 f"prediction of {loaded.key.name}: has shape {image.shape}, expected {loaded.view.image.shape}"
             )
+        if image is not None and loaded.view.hidden is not None:
+            image = _with_truth(image, loaded.view)
         for preset in self.presets:
             if image is None:
                 scores |= preset.absent(protocol.regions, background, "no prediction of this view")
             else:
                 scores |= evaluate(
-                    image, loaded.view.image, loaded.regions, preset, background, slow, protocol.regions
+                    image,
+                    loaded.view.image,
+                    loaded.regions,
+                    preset,
+                    background,
+                    slow,
+                    protocol.regions,
+                    self.withheld,
                 )
         return ViewScores(loaded.key, scores)
 
@@ -165,3 +182,10 @@ class Scorer:
                     yield waiting.popleft().result()
             finally:
                 pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _with_truth(image: NDArray, view: TestView) -> NDArray:
+    """A prediction [H, W, 3] with the truth's paint where the truth is not known: whoever drew the person there and
+    whoever left them out are told the same."""
+    paint = rounded(view.image) if image.dtype == np.uint8 else view.image.astype(image.dtype)
+    return np.where(view.hidden[..., None], paint, image)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from threading import Lock
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +19,16 @@ from numpy.typing import NDArray
 from ihbench.camera import Camera
 from ihbench.errors import BadInput
 from ihbench.metrics.images import bounds
-from ihbench.occlusion import OcclusionPlan, apply_rule
+from ihbench.occlusion import OcclusionPlan, apply_rule, grown_for_clothes
 from ihbench.protocol import ImageRule, Protocol
-from ihbench.scene import Capture, MaskState, TestView, TrainView
+from ihbench.scene import BodyPose, Capture, MaskState, TestView, TrainView
+
+if TYPE_CHECKING:
+    from ihbench.body import Body
 
 View = TypeVar("View")
 LEVELS = (np.arange(256) / 255).astype(np.float32)  # of 8-bit images
+REACH = 0.4  # m from its nearest joint, more than which no part of a body or its clothes is away
 MAX_HELD = 700  # views kept in memory: 512² training views of this many take about 700 MB
 
 
@@ -155,6 +159,11 @@ class Undistorter:
             camera = camera.undistorted()
         self.size = rule.extent(camera.width, camera.height)
         self.camera = camera.scaled(*self.size)
+        # [h, w] pixels whose ray left the original image (a pincushion lens reaches out of it); None for none
+        self.unphotographed: NDArray[np.bool_] | None = None
+        if self._maps is not None:
+            beyond = self.straighten(np.full((camera.height, camera.width), 255, np.uint8)) < 255
+            self.unphotographed = self.shrink(beyond.astype(np.float32), "area") > 0 if beyond.any() else None
 
     def straighten(self, image: NDArray[Any]) -> NDArray[Any]:
         if self._maps is None:
@@ -213,6 +222,20 @@ class Undistorter:
         """Pixels with any part of a hidden original pixel in them: their colour is not to be trusted."""
         return self.shrink((self.straighten(hidden.astype(np.uint8) * 255) > 0).astype(np.float32), "area") > 0
 
+    def cut_off(self, body: Body, body_pose: BodyPose) -> NDArray[np.bool_] | None:
+        """[h, w] pixels that no photograph shows although the body may be there; None for none."""
+        if self.unphotographed is None:
+            return None
+        from ihbench.regions import projected_box
+        from ihbench.render.zbuffer import rasterize
+
+        camera = self.camera
+        if not (self.unphotographed & projected_box(body.posed_joints(body_pose), camera, REACH)).any():
+            return None  # as a rule: nobody near the borders, nothing to draw
+        drawn = rasterize(camera.project(body.pose(body_pose)), body.faces, camera.height, camera.width).mask
+        cut = self.unphotographed & grown_for_clothes(drawn)
+        return cut if cut.any() else None
+
 
 def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
     """Apply a protocol to a capture. Pixels are read lazily.
@@ -239,7 +262,7 @@ def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
         )
     hiding = apply_rule(protocol, capture)
     frames, covered = hiding.frames, hiding.covered
-    undistort = {protocol.train_camera: Undistorter(capture.camera(protocol.train_camera), protocol.image)}
+    lenses = {protocol.train_camera: Undistorter(capture.camera(protocol.train_camera), protocol.image)}
     last_touched: dict[int, tuple[NDArray[np.bool_], NDArray[np.bool_]]] = {}  # most rules hide the same every time
 
     def hidden_of(frame: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -247,7 +270,7 @@ def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
         hidden = hiding.occlusion.hidden(frame)
         known = last_touched.get(0)
         if known is None or known[0] is not hidden:
-            touched = undistort[protocol.train_camera].touched(np.ascontiguousarray(hidden))
+            touched = lenses[protocol.train_camera].touched(np.ascontiguousarray(hidden))
             known = last_touched[0] = (hidden, touched)
         return known
 
@@ -255,20 +278,22 @@ def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
         return capture.silhouette(camera, frame, protocol.silhouette)
 
     def train_view(k: int) -> TrainView:
-        lens, frame = undistort[protocol.train_camera], frames[k]
+        lens, frame = lenses[protocol.train_camera], frames[k]
         person = silhouette(protocol.train_camera, frame)
         image = capture.image(protocol.train_camera, frame)
-        hidden = hidden_small = None
+        unknown = [lens.cut_off(capture.model, capture.body_pose(frame))] if lens.unphotographed is not None else []
         if covered[k]:
-            hidden, hidden_small = hidden_of(frame)
+            hidden, touched = hidden_of(frame)
+            unknown.append(touched)
             person = person & ~hidden
             # before anything is resampled: lens and kernel would carry hidden colours out of the strip
             image = np.where(hidden[..., None], lens.background, image)
         image, mask = lens.person(image, person)
         state = np.where(mask, MaskState.PERSON, MaskState.BACKGROUND).astype(np.uint8)
-        if hidden_small is not None:
-            state[hidden_small] = MaskState.UNKNOWN
-            image[hidden_small] = lens.background
+        for pixels in unknown:
+            if pixels is not None:
+                state[pixels] = MaskState.UNKNOWN
+                image[pixels] = lens.background
         return TrainView(
             image, state, lens.camera, capture.body_pose(frame), frame, capture.camera_ids[protocol.train_camera]
         )
@@ -282,17 +307,21 @@ def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
 
     def test_view(k: int) -> TestView:
         key = keys[k]
-        if key.camera not in undistort:
-            undistort[key.camera] = Undistorter(capture.camera(key.camera), protocol.image)
-        lens, person = undistort[key.camera], silhouette(key.camera, key.frame)
+        if key.camera not in lenses:
+            lenses[key.camera] = Undistorter(capture.camera(key.camera), protocol.image)
+        lens, person = lenses[key.camera], silhouette(key.camera, key.frame)
         image, mask = lens.person(capture.image(key.camera, key.frame), person)
+        hidden = None
+        if lens.unphotographed is not None:
+            hidden = lens.cut_off(capture.model, capture.body_pose(key.frame))
+        if hiding.in_scene:
+            standing = lens.touched(np.ascontiguousarray(hiding.in_test(key.camera).hidden(key.frame)))
+            hidden = standing if hidden is None else hidden | standing
+        if hidden is not None:
+            mask &= ~hidden
+            image[hidden] = lens.background
         return TestView(
-            LEVELS[image],
-            mask,
-            lens.camera,
-            capture.body_pose(key.frame),
-            key.frame,
-            key.camera_id,
+            LEVELS[image], mask, lens.camera, capture.body_pose(key.frame), key.frame, key.camera_id, hidden
         )
 
     return OccludedScene(
@@ -303,3 +332,14 @@ def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
         keys,
         LazyViews(test_view, len(keys), held=64),
     )
+
+
+def uncovered(scene: OccludedScene) -> OccludedScene:
+    """The scene without its occluder, for those who ask what a painter could have known. Raises `BadInput` where the
+    occluder stands in the scene: nobody knows what is behind it."""
+    if scene.hiding.in_scene:
+        raise BadInput(
+            f"{scene.capture.dataset} {scene.capture.name}: the occluder of {scene.protocol.name} stands in the "
+            "scene, nobody knows what is behind it; name a rule that draws its occluder"
+        )
+    return open_scene(scene.capture, scene.protocol.with_occlusion("none"))

@@ -8,17 +8,18 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.errors import BadInput
-from ihbench.occlusion import Mask, Occlusion, OcclusionRequest
+from ihbench.occlusion import Mask, Occlusion, OcclusionRequest, grown_for_clothes, occluder
 
-CLOTHES = 0.02  # share of the projected body's height by which garments may stand off it
 BLOCKS_ACROSS = 12  # random blocks along the longer side of the person
 
 
+@occluder(takes_fraction=False)
 def none(request: OcclusionRequest) -> Occlusion:
     """Hides nothing."""
     nothing: Mask = np.broadcast_to(np.False_, (request.height, request.width))
@@ -29,6 +30,7 @@ def none(request: OcclusionRequest) -> Occlusion:
 # The same columns in every covered frame
 
 
+@occluder(takes_fraction=False)
 def fixed_strip(request: OcclusionRequest) -> Occlusion:
     """All rows of columns [mid - width//2, mid + width//2), the same in every covered frame.
 
@@ -178,20 +180,15 @@ def pasted_object(request: OcclusionRequest) -> Occlusion:
     return _per_frame("object", request, hidden)
 
 
+@occluder(in_scene=True, takes_fraction=False)
 def natural(request: OcclusionRequest) -> Occlusion:
     """What stands before the person in the image itself: the projected body, a little grown for clothes, where the
     mask of visible pixels does not show it. For data whose masks are of visible pixels (OcMotion)."""
-    from scipy.ndimage import binary_dilation
 
-    def hidden(frame: int, person: Mask) -> Mask:
-        body = request.body_mask(frame)
-        rows = np.flatnonzero(body.any(1))
-        if len(rows) == 0:
-            return np.zeros(person.shape, bool)
-        margin = max(1, round(CLOTHES * (rows[-1] - rows[0] + 1)))
-        return np.asarray(binary_dilation(body, iterations=margin), bool) & ~person
+    def hidden(frame: int) -> Mask:  # also of a person of whom nothing shows
+        return grown_for_clothes(request.body_mask(frame)) & ~request.silhouette(frame)
 
-    return _per_frame("natural", request, hidden)
+    return Occlusion("natural", hidden, {})
 
 
 def _per_frame(rule: str, request: OcclusionRequest, hidden: Callable[[int, Mask], Mask]) -> Occlusion:
@@ -199,11 +196,9 @@ def _per_frame(rule: str, request: OcclusionRequest, hidden: Callable[[int, Mask
 
     def of(frame: int) -> Mask:
         person = request.silhouette(frame)
-        if not person.any() and rule != "natural":
-            return np.zeros(person.shape, bool)
-        return hidden(frame, person)
+        return hidden(frame, person) if person.any() else np.zeros(person.shape, bool)
 
-    record = {} if rule == "natural" else {"fraction": request.rule.fraction}
+    record: dict[str, Any] = {"fraction": request.rule.fraction}
     if rule in ("blocks", "object"):
         record["seed"] = request.rule.seed
     return Occlusion(rule, of, record)

@@ -93,6 +93,10 @@ def _print(report: dict) -> None:
         m = found["measure"]
         print(f"  {m['training_views']} training views ({m['covered_views']} occluded), {m['test_views']} test views")
         print(f"  occlusion {m['occlusion']}: hides {m['hidden_share']:.0%} of the person in occluded views")
+        if m["in_scene"]:
+            print(
+                "  the occluder stands in the scene: every frame is covered, what it hides in tests is in no region"
+            )
         print(
             f"  surface: {m['visible_texels']:.0%} seen, {m['hidden_texels']:.0%} only behind the occluder, "
             f"{m['never_seen_texels']:.0%} never faced the camera"

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
 from ihbench.commands.parse import options
-from ihbench.protocol import difference, flatten, load_protocol
+from ihbench.commands.scene_choice import ProtocolChanges
+from ihbench.occlusion import withheld
+from ihbench.protocol import Protocol, difference, flatten, load_protocol
 
 
-@dataclass(frozen=True)
-class Show:
-    """Every choice of one protocol."""
+@dataclass(frozen=True, kw_only=True)
+class Show(ProtocolChanges):
+    """Every choice of one protocol, and the regions that have no number under it."""
 
     protocol: Annotated[str, tyro.conf.Positional]
     """Name of the protocol."""
@@ -48,19 +50,22 @@ def main(argv: list[str]) -> int:
 
 
 def _show(chosen: Show) -> int:
-    protocol = load_protocol(chosen.protocol, chosen.profile)
+    protocols = chosen.apply(load_protocol(chosen.protocol, chosen.profile))
+    shown = [_shown(protocol) for protocol in protocols]
     if chosen.json:
-        print(
-            json.dumps(
-                {**protocol.content, "profile": protocol.profile, "digest": protocol.digest}, ensure_ascii=False
-            )
-        )
+        print(json.dumps(shown[0] if len(shown) == 1 else {"protocols": shown}, ensure_ascii=False))
         return 0
-    pairs = [*flatten(protocol.content), ("profile", f'"{protocol.profile}"'), ("digest", f'"{protocol.digest}"')]
-    width = max(len(key) for key, _ in pairs)
-    for key, value in pairs:
-        print(f"{key:<{width}}  {value}")
+    for k, content in enumerate(shown):
+        pairs = list(flatten(content))
+        width = max(len(key) for key, _ in pairs)
+        print("\n" * bool(k) + "\n".join(f"{key:<{width}}  {value}" for key, value in pairs))
     return 0
+
+
+def _shown(protocol: Protocol) -> dict[str, Any]:
+    absent = withheld(protocol.regions) if protocol.occlusion.in_scene else {}
+    ends = {"profile": protocol.profile, "digest": protocol.digest}
+    return {**protocol.content, **({"absent": absent} if absent else {}), **ends}
 
 
 def _diff(chosen: Diff) -> int:

@@ -21,7 +21,7 @@ class OcclusionChoice:
     fraction: tuple[float, ...] = ()
     """Share of the person to hide in covered frames; several make a sweep."""
     covers: float | None = None
-    """Share of the training frames that are covered."""
+    """Share of the training frames that are covered; all of them where the occluder stands in the scene (natural)."""
 
 
 @dataclass(frozen=True, kw_only=True)

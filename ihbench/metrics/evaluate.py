@@ -142,12 +142,14 @@ def evaluate(
     background: Color = (1.0, 1.0, 1.0),
     slow: bool = True,
     over: Sequence[str] | None = None,
+    withheld: Mapping[str, str] | None = None,
 ) -> dict[str, Score]:
     """Score one frame: identity string -> score, for every region and every metric of the preset.
 
     A region is a bool mask [H, W], None for the whole frame, or a string: the reason why it does not exist here,
     which becomes the reason of its scores. No regions means the whole frame, `full`. Numbers are taken over all of
-    them, or over those named in `over`, the others serving as crops. A preset that has regions of its own (the
+    them, or over those named in `over`, the others serving as crops; none is taken over a region in `withheld`, which
+    says why, and which may still serve as a crop. A preset that has regions of its own (the
     released evaluators do) takes those, and a region it needs that is not given is a reason too.
     `background` is what the images were composited on and what is painted outside a region. `slow=False` leaves out
     the metrics that take a network. Raises `ValueError` for shapes and dtypes that do not match and for images of
@@ -168,7 +170,7 @@ def evaluate(
     scores: dict[str, Score] = {}
     known: list[tuple[Mask | None, dict[int, float | str]]] = []
     for name in chosen.regions(asked):
-        region = given.get(name, f"region {name!r} was not given")
+        region = (withheld or {}).get(name) or given.get(name, f"region {name!r} was not given")
         outcomes: dict[int, float | str] = {}
         if frame is not None and not isinstance(region, str):
             outcomes = _known_outcomes(region, known)

@@ -93,6 +93,7 @@ class DrawnCapture:
     variant: str = "memory"
     standin: str = "drawn"
     body: str = "procedural"
+    visible_masks: bool = False
     edit_image: Edit = untouched
     edit_silhouette: Edit = untouched
     n_frames: int = field(init=False)

@@ -29,7 +29,7 @@ from ihbench.reopen import reopen_scene
 from ihbench.results import read_result
 from ihbench.scene import MaskState, TrainingSet, TrainView
 from ihbench.scoring import Scorer
-from ihbench.views import OccludedScene, open_scene
+from ihbench.views import OccludedScene, uncovered
 
 STATES = (Stage1.name, PAINTED_STATE)
 
@@ -60,7 +60,7 @@ def ceiling(
     if missing:
         raise BadInput(f"{folder}: has no saved state {missing[0]}; only runs that paint have a ceiling of painting")
     scene, model = reopen_scene(folder, data, body)
-    whole = open_scene(scene.capture, scene.protocol.with_occlusion("none")).train
+    whole = uncovered(scene).train
     fitted = GaussianAvatar.load(folder / "avatar", model)
     training = TrainingSet(scene.train, model, scene.protocol.image.background, scene.capture.name)
     seed = int(result.identity["seed"])

@@ -212,7 +212,7 @@ def test_data_check_writes_a_picture_and_leaves_the_data_alone(ocmotion, tmp_pat
     status = main(["data", "check", str(ocmotion), "--overlays", str(tmp_path / "seen"), "--json"])
     found = json.loads(capsys.readouterr().out)
     assert status == 0
-    assert found["subjects"][0]["protocols"]["ocmotion_visible@1"].startswith("has 6 frames")
+    assert found["subjects"][0]["protocols"]["ocmotion_visible@2"].startswith("has 6 frames")
     picture = np.asarray(Image.open(tmp_path / "seen" / "standin-2.png"))
     assert picture.shape == (180, 3 * 240, 3)
     assert (picture == (0, 220, 255)).all(-1).any()  # the body's outline

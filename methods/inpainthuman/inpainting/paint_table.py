@@ -20,7 +20,7 @@ from ihbench.metrics.statistics import mean_interval, paired_test
 from ihbench.progress import Progress
 from ihbench.protocol import Protocol
 from ihbench.scene import Capture
-from ihbench.views import open_scene
+from ihbench.views import open_scene, uncovered
 
 SIZES = {"mini": (128, False), "sd2": (512, True)}  # px, height of all painters' crops, and whether they are square
 SCORES = ("psnr", "ssim", "flip")
@@ -41,8 +41,8 @@ def paint_scene(
     from ihbench.methods.inpainthuman.inpainting.drift import flicker, hidden_scores, identity_drift
 
     size, square = SIZES[config.backbone]
-    occluded = open_scene(capture, protocol).train
-    whole = open_scene(capture, protocol.with_occlusion("none")).train
+    scene = open_scene(capture, protocol)
+    occluded, whole = scene.train, uncovered(scene).train
     with progress.task(f"cutting {capture.name}", 2 * len(occluded)) as task:
         views, truths = [], []
         for k in range(len(occluded)):
