@@ -12,15 +12,25 @@ import errno
 import json
 import math
 import os
+import re
 import secrets
+import stat
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
+from ihbench import removal
 from ihbench.errors import BadInput
 
 NON_FINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
+MOST_LINKS = 40  # as the system follows
+# how an open stream of a process is named, by Linux and by others
+OPEN_FILE = re.compile(r"(?:/proc/(?P<process>\d+)(?:/task/\d+)?|/dev)/fd/(?P<number>\d+)")
+STRAY = re.compile(r"\..+\.\d+\.[0-9a-f]{8}\.tmp")  # what `_beside` makes
 
 USER_ERRORS = {
     errno.ENOSPC: "disk full",
@@ -33,32 +43,68 @@ USER_ERRORS = {
     errno.ENOTDIR: "a file stands where a folder should be",
     errno.EISDIR: "a folder stands where the file should be",
     errno.ENAMETOOLONG: "name too long",
+    errno.ENOENT: "no such place",
+    errno.ELOOP: "links that lead in a circle",
+    errno.ENXIO: "nobody reads there",
+    errno.ENODEV: "no such device",
+    errno.EBUSY: "in use",
+    errno.ETXTBSY: "in use",
 }
 
 
 def write_bytes(path: Path, data: bytes, durable: bool = True) -> None:
     """Write the file whole, or leave what was there. Missing parent folders are made.
 
-    The data go to a file beside it, reach the disk, and only then take the name. `durable=False` skips the wait for
-    the disk: for files by the thousand that can be made again; a killed process still leaves no half file. Raises
-    `BadInput` when the disk is full or may not be written.
+    See `replaced`. What is no regular file (a terminal, a pipe, /dev/null, /dev/stdout) is written into instead.
+    Raises `BadInput` when the disk is full or may not be written.
     """
     path = Path(path)
-    temporary = _beside(path)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with open(temporary, "xb") as file:
-            file.write(data)
-            file.flush()
-            if durable:
+        stream = _stream(path)
+        if stream is not None:
+            with stream:
+                stream.write(data)
+            return
+    except OSError as error:
+        raise _explained(error, path) from error
+    with replaced(path, durable) as temporary:
+        temporary.write_bytes(data)
+
+
+@contextmanager
+def replaced(path: Path, durable: bool = True) -> Iterator[Path]:
+    """A file to write into, which takes the name `path` at the end of the block if nothing was raised in it.
+
+    The data go to a file beside it, reach the disk, and only then take the name. `durable=False` skips the wait for
+    the disk: for files by the thousand that can be made again; a killed process still leaves no half file. A link is
+    followed, and stays; a file that was there passes on its mode and owner; its other names (hard links) keep the old
+    content, as copies made with them should. Raises `BadInput` when the disk is full or may not be written.
+    """
+    path = Path(path)
+    target = Path(os.path.realpath(path))
+    temporary = _beside(target)
+    try:
+        before = _regular(path)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        # nobody else reads what takes the place of a file that nobody else may read
+        os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666 if before is None else 0o600))
+        yield temporary
+        if durable:
+            with open(temporary, "rb+") as file:
                 os.fsync(file.fileno())
-        os.replace(temporary, path)
+        _take_after(temporary, before)
+        try:
+            os.replace(temporary, target)
+        except OSError as error:
+            if error.errno != errno.EBUSY:
+                raise
+            _overwrite(target, temporary.read_bytes())  # a file of its own mount, as containers get them
     except OSError as error:
         raise _explained(error, path) from error
     finally:
-        _remove_file(temporary)
+        removal.discard_file(temporary)
     if durable:
-        _sync_folder(path.parent)
+        _sync_folder(target.parent)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -127,11 +173,87 @@ def _beside(path: Path) -> Path:
     return path.parent / f".{path.name[:60]}.{os.getpid()}.{secrets.token_hex(4)}.tmp"
 
 
-def _remove_file(path: Path) -> None:
+def is_stray(name: str) -> bool:
+    """Whether a file of this name was left by a process that was killed while it wrote."""
+    return STRAY.fullmatch(name) is not None
+
+
+def is_stream(path: Path) -> bool:
+    """Whether `write_bytes` writes into what is there: a terminal, a pipe, a device, a stream of this process."""
+    if _own_stream(path) is not None:
+        return True
     try:
-        path.unlink()
-    except OSError:  # the usual case: it has been renamed
+        mode = os.stat(path).st_mode
+    except (OSError, ValueError):
+        return False
+    return not stat.S_ISREG(mode) and not stat.S_ISDIR(mode)
+
+
+def _stream(path: Path) -> BinaryIO | None:
+    """What is there, opened for writing, or None where a file belongs. A disk is never written into."""
+    own = _own_stream(path)
+    if own is not None:
+        for stream in (sys.stdout, sys.stderr):
+            if stream is not None:
+                stream.flush()
+        return os.fdopen(os.dup(own), "wb")  # not opened again: that would cut off what `>>` keeps
+    if not is_stream(path):
+        return None
+    if stat.S_ISBLK(os.stat(path).st_mode):
+        raise BadInput(f"{path}: is a whole disk or a part of one, which is never written into; name a file")
+    return open(path, "wb")
+
+
+def _own_stream(path: Path) -> int | None:
+    """The number of this process's open stream that a path names, as /dev/stdout and /dev/fd/3 do, or None."""
+    for _ in range(MOST_LINKS):
+        place = os.path.realpath(path.parent)
+        named = OPEN_FILE.fullmatch(os.path.join(place, path.name))
+        if named is not None:
+            return int(named["number"]) if named["process"] in (None, str(os.getpid())) else None
+        try:
+            path = Path(place, os.readlink(path))
+        except (OSError, ValueError):
+            return None
+    return None
+
+
+def _regular(path: Path) -> os.stat_result | None:
+    """What is known of the file that is there, or None where there is none. Raises `OSError` where it may not be
+    replaced: it is a folder, or its owner has taken the right to write away."""
+    try:
+        about = os.stat(path)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    if stat.S_ISDIR(about.st_mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+    if not stat.S_ISREG(about.st_mode):
+        raise OSError(errno.EISDIR, "a device")
+    if not os.access(path, os.W_OK):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    return about
+
+
+def _take_after(file: Path, before: os.stat_result | None) -> None:
+    """Give a new file the owner and mode of the one that it will replace, as far as the system lets us."""
+    if before is None:
         return
+    with suppress(OSError, AttributeError):
+        new = os.stat(file)
+        if (new.st_uid, new.st_gid) != (before.st_uid, before.st_gid):
+            os.chown(file, before.st_uid, before.st_gid)
+    with suppress(OSError):
+        os.chmod(file, stat.S_IMODE(before.st_mode))
+
+
+def _overwrite(file: Path, data: bytes) -> None:
+    """Write into a file that cannot be replaced; put back what was there if that fails."""
+    before = file.read_bytes()
+    try:
+        file.write_bytes(data)
+    except OSError:
+        file.write_bytes(before)
+        raise
 
 
 def _sync_folder(folder: Path) -> None:

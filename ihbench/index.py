@@ -11,6 +11,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+from ihbench import removal
 from ihbench.errors import BadInput
 from ihbench.results import mean_rows
 from ihbench.store import RunFolder
@@ -80,7 +81,7 @@ class Index:
         except (OSError, sqlite3.OperationalError) as error:
             raise BadInput(f"{self.file}: cannot be written ({error}); make room or check permissions") from error
         finally:
-            temporary.unlink(missing_ok=True)
+            removal.discard_file(temporary)
         return len(folders)
 
     def _select(self, statement: str, values: dict[str, Any]) -> list[dict[str, Any]]:

@@ -11,16 +11,17 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shutil
-from collections.abc import Callable, Iterator
+import secrets
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from glob import escape
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench import __version__, atomic, registry
+from ihbench import __version__, atomic, locks, registry, removal
 from ihbench.body import Body
 from ihbench.camera import Camera
 from ihbench.errors import BadInput
@@ -61,35 +62,110 @@ TrainingLayout = Callable[[Handout], Path]  # writes the files and returns the s
 
 
 def prepare(
-    scene: OccludedScene, body: Body, out: Path, layout: str, progress: Progress, force: bool = False
+    scene: OccludedScene,
+    body: Body,
+    out: Path,
+    layout: str,
+    progress: Progress,
+    force: bool = False,
+    sources: Sequence[Path] = (),
 ) -> Path:
     """Write one scene's training set below `out` and return its folder `out`/NAME, with manifest and test views.
 
-    The folder appears when it is complete. Raises `BadInput` when it exists and `force` is not given, and for an
-    unknown layout.
+    The folder appears when it is complete. `force` replaces a folder that holds what an earlier call wrote and
+    nothing else; `sources` are places that are only read, such as the data. Raises `BadInput` as `check_target` does,
+    and for an unknown layout.
     """
     write: TrainingLayout = registry.load("training layout", layout)
+    check_target(out, scene.capture.name, force, sources)
     target = out / scene.capture.name
-    if target.exists() and not force:
-        raise BadInput(f"{target}: is there already; name another folder with --out, or --force to replace it")
-    partial = out / f".{scene.capture.name}.partial"
-    shutil.rmtree(partial, ignore_errors=True)
+    partial = out / f".{scene.capture.name}.{secrets.token_hex(4)}.partial"
+    before, lock = partial.with_suffix(".before"), partial.with_suffix(".lock")
     try:
-        manifest = _write(scene, body, partial, layout, write, progress)
-        if target.exists():
-            shutil.rmtree(target)
-        os.replace(partial, target)
+        with locks.locked(lock, "name another folder with --out"):
+            _remove_leftovers(out, scene.capture.name)
+            _write(scene, body, partial, layout, write, progress)
+            if target.exists():
+                check_target(out, scene.capture.name, force, sources)  # again: meanwhile anything may have come there
+                os.rename(target, before)
+            os.rename(partial, target)
+            if before.exists():
+                removal.remove_written(before, _written_there(before))
+                before.rmdir()
     except OSError as error:
         raise BadInput(f"{target}: cannot be written ({error.strerror or error}); name another folder") from error
     finally:
-        shutil.rmtree(partial, ignore_errors=True)
-    assert manifest
+        removal.discard(partial)
+        removal.discard_file(lock)
+        if before.exists() and not target.exists():
+            os.rename(before, target)
     return target
+
+
+def _remove_leftovers(out: Path, name: str) -> None:
+    """Remove what earlier calls left that were killed; what is being written now is locked."""
+    for lock in out.glob(f".{escape(name)}.{8 * '[0-9a-f]'}.lock"):
+        if not locks.is_held(lock):
+            removal.discard(lock.with_suffix(".partial"))
+            removal.discard_file(lock)
+
+
+def check_target(out: Path, name: str, force: bool, sources: Sequence[Path]) -> None:
+    """Raise `BadInput` where `prepare` may not write `out`/NAME: in the data or around them; and where something is,
+    unless `force` is given and it is what an earlier call wrote, every file as its manifest has it."""
+    target = out / name
+    removal.check_apart(target, sources, "the training set")
+    if not os.path.lexists(target):
+        return
+    try:
+        problem = _not_ours(target)
+    except OSError as error:
+        problem = f"cannot be read: {error.strerror or error}"
+    if problem:
+        raise BadInput(
+            f"{target}: is there already and not just what ihbench prepare wrote ({problem}); "
+            f"name another folder with --out"
+        )
+    if not force:
+        raise BadInput(f"{target}: is there already; name another folder with --out, or --force to replace it")
+    removal.check_no_home(target)
+
+
+def _not_ours(target: Path) -> str:
+    """What speaks against a folder's being what an earlier call wrote, and empty where nothing does."""
+    if target.is_symlink() or not target.is_dir():
+        return "it is no folder" if target.exists() and not target.is_dir() else "it is a link"
+    try:
+        ours = _written_there(target)
+    except BadInput as error:
+        return str(error)
+    stranger = removal.foreign(target, ours)
+    return "" if stranger is None else f"{stranger.relative_to(target)} is not as its manifest has it"
+
+
+def _written_there(folder: Path) -> removal.Ours:
+    """Whether a file in a folder is the one that an earlier call wrote there, to the last bit. Raises `BadInput`
+    where no earlier call wrote the folder."""
+    path = folder / MANIFEST
+    if path.is_symlink() or not path.is_file():
+        raise BadInput(f"it has no {MANIFEST}")
+    manifest = atomic.read_json(path)
+    files = manifest.get("files") if isinstance(manifest, dict) else None
+    if not isinstance(files, dict) or not str(manifest.get("made_by", "")).startswith("ihbench "):
+        raise BadInput(f"its {MANIFEST} is not one of ours")
+
+    def ours(file: Path) -> bool:
+        if file.as_posix() == MANIFEST:
+            return True
+        sha = files.get(file.as_posix())
+        return sha is not None and sha == hashlib.sha256((folder / file).read_bytes()).hexdigest()
+
+    return ours
 
 
 def _write(
     scene: OccludedScene, body: Body, folder: Path, layout: str, write: TrainingLayout, progress: Progress
-) -> dict[str, Any]:
+) -> None:
     views: list[TrainView] = scene.train  # type: ignore[assignment]
     folder.mkdir(parents=True)
     cameras, poses, states = [], [], []
@@ -153,7 +229,6 @@ def _write(
         },
     }
     atomic.write_json(folder / MANIFEST, manifest)
-    return manifest
 
 
 def _test_views(scene: OccludedScene, body: Body) -> Iterator[dict[str, Any]]:

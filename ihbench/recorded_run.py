@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from ihbench import atomic, machine
+from ihbench import atomic, machine, removal
 from ihbench.errors import BadInput, Diverged
 from ihbench.ledger import Ledger, OnCheckpoint
 from ihbench.progress import Progress
@@ -36,7 +36,7 @@ class RecordedRun(ABC):
         self.ledger = Ledger(folder.path, device=device, state=before, on_checkpoint=on_checkpoint)
         if before is not None:
             folder.restarted()
-            (folder.path / TRACEBACK).unlink(missing_ok=True)
+            removal.discard_file(folder.path / TRACEBACK)
 
     @abstractmethod
     def work(self) -> None:

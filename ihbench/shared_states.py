@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -39,10 +38,7 @@ def lender(
 def lend(other: RunFolder, borrower: RunFolder, state: str) -> list[dict[str, Any]]:
     """Copy the state, and the points of the quality-time curve up to it. Gives the ledger's events of that stage."""
     target = _file(borrower.path, state)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    copy = target.with_name(f".{target.name}.tmp")
-    shutil.copyfile(_file(other.path, state), copy)
-    copy.replace(target)
+    atomic.write_bytes(target, _file(other.path, state).read_bytes())
     last = _last_step(target)
     points = [point for point in other.curve() if point["step"] <= last]
     atomic.write_json_lines(borrower.path / "curve.jsonl", points)

@@ -17,15 +17,14 @@ import hashlib
 import json
 import os
 import re
-import shutil
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from ihbench import atomic, machine
+from ihbench import atomic, locks, machine, removal
 from ihbench.errors import BadInput
 from ihbench.ledger import Ledger
 from ihbench.provenance import provenance
@@ -34,6 +33,18 @@ SCHEMA_VERSION = 1
 STATUSES = ("running", "done", "diverged", "failed", "interrupted", "skipped", "timeout")
 FINISHED = ("done", "diverged", "skipped")  # running such a run again would end the same way
 HASH_LENGTH = 10
+LOCK = "lock"
+# what the bench writes into a run folder: whatever else lies there is the user's, and stays
+WRITTEN = {
+    "": {
+        "run.json", "scores.jsonl", "calibration.jsonl", "curve.jsonl", "traceback.txt", "contact_sheet.png",
+        "inpainting.png", "avatar.ply",
+    },
+    "avatar": {".safetensors", ".json", ".npz", ".npy", ".pt", ".pth", ".bin"},
+    "checkpoints": {".safetensors"},
+    "presets": {".jsonl"},
+    "renders": {".png"},  # of a number
+}  # fmt: skip
 
 Record = dict[str, Any]
 
@@ -97,14 +108,15 @@ class RunFolder:
         """
         path = Path(runs) / identity.folder_name
         if force:
-            with _locked(path):
+            with _locked(path), _movable(path):
                 _set_aside(path)
         warnings = []
         if (path / "run.json").exists():
             try:
                 run = cls.open(path)
             except DamagedRecord as damage:
-                os.replace(path / "run.json", path / "run.json.damaged")
+                damaged = _free_name(path / "run.json.damaged")
+                os.rename(path / "run.json", damaged)
                 warnings.append(f"run.json was damaged and the run started again: {damage}")
             else:
                 if run.record["identity"] != _as_read(identity):
@@ -227,11 +239,13 @@ class RunFolder:
         old = _aside(self.path)
         if not old.is_dir():
             return
-        if not keep_new:
-            _empty(self.path)
-            for entry in old.iterdir():
-                os.replace(entry, self.path / entry.name)
-        shutil.rmtree(old)
+        with _movable(self.path):
+            if not keep_new:
+                removal.remove_written(self.path, _is_ours)
+                removal.move_written(old, self.path, _is_ours, "run.json")
+            removal.remove_written(old, _is_ours)
+        with suppress(OSError):  # it holds something that is not ours
+            old.rmdir()
 
     @contextmanager
     def lock(self) -> Iterator[None]:
@@ -240,8 +254,7 @@ class RunFolder:
         Ask `finished` inside. Raises `BadInput` naming the process that is writing.
         """
         with _locked(self.path):
-            for stray in self.path.glob(".*.tmp"):  # left by a process killed while writing
-                stray.unlink(missing_ok=True)
+            removal.remove_written(self.path, lambda path: atomic.is_stray(path.name))  # of a process that was killed
             self.record = RunFolder.open(self.path).record
             yield
 
@@ -271,38 +284,32 @@ def _checked(file: Path, record: Any) -> Record:
     return record
 
 
+def _free_name(path: Path) -> Path:
+    """The path, or the first of path-2, path-3, … that is not there."""
+    number, free = 1, path
+    while os.path.lexists(free):
+        number, free = number + 1, path.with_name(f"{path.name}-{number + 1}")
+    return free
+
+
 def _as_read(identity: RunIdentity) -> Record:
     """The identity as it comes back from JSON, so that the two can be compared."""
     return atomic.decode(json.loads(json.dumps(atomic.encode(identity))))
 
 
-@contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    """The system's own file lock: it ends with the process however that ends, so a stale one is never in the way."""
-    import fcntl
+def _locked(path: Path) -> AbstractContextManager[None]:
+    """Keep other processes from writing a run folder."""
+    return locks.locked(path / LOCK, "choose another --runs folder")
 
+
+@contextmanager
+def _movable(path: Path) -> Iterator[None]:
     try:
-        path.mkdir(parents=True, exist_ok=True)
-        lock = open(path / "lock", "a+", encoding="utf-8")  # noqa: SIM115 (closed below)
+        yield
     except OSError as error:
-        raise BadInput(f"{path}: cannot be written ({error.strerror}); choose another --runs folder") from error
-    with lock as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            file.seek(0)
-            owner = file.read(100).strip() or "another process"
-            raise BadInput(
-                f"{path}: being written by {owner}; wait for it to end, or choose another --runs folder"
-            ) from error
-        file.truncate(0)
-        file.write(f"process {os.getpid()}")
-        file.flush()
-        try:
-            yield
-        finally:
-            file.truncate(0)
-            fcntl.flock(file, fcntl.LOCK_UN)
+        raise BadInput(
+            f"{path}: cannot be replaced ({error.strerror or error}); choose another --runs folder"
+        ) from error
 
 
 def _aside(path: Path) -> Path:
@@ -312,34 +319,27 @@ def _aside(path: Path) -> Path:
 
 def _set_aside(path: Path) -> None:
     """Make room for a forced run. What is not finished is not worth keeping."""
-    old = _aside(path)
-    if path.is_symlink() or not (path / "run.json").is_file() or old.exists():
-        _empty(path)
-        return
-    try:
-        finished = RunFolder.open(path).finished
-    except BadInput:
-        finished = False
-    if not finished:
-        _empty(path)
-        return
-    old.mkdir(parents=True)
-    for entry in path.iterdir():
-        if entry.name != "lock":
-            os.replace(entry, old / entry.name)
-
-
-def _empty(path: Path) -> None:
-    """Remove what a run left, but never follow a link out of it, and keep the lock that the caller may hold."""
     if path.is_symlink():
         raise BadInput(f"{path}: is a link; --force only empties real run folders, remove the link")
-    for entry in path.iterdir() if path.is_dir() else ():
-        if entry.name == "lock":
-            continue
-        if entry.is_dir() and not entry.is_symlink():
-            shutil.rmtree(entry)
-        else:
-            entry.unlink()
+    old = _aside(path)
+    try:
+        finished = not (old / "run.json").exists() and RunFolder.open(path).finished
+    except BadInput:
+        finished = False
+    if finished:
+        removal.move_written(path, old, _is_ours, "run.json")
+    else:
+        removal.remove_written(path, _is_ours)
+
+
+def _is_ours(path: Path) -> bool:
+    """Whether the bench writes what has this path in a run folder."""
+    top = path.parts[0]
+    if len(path.parts) == 1:
+        return path.name in WRITTEN[""] or path.name in WRITTEN or atomic.is_stray(path.name)
+    if top == "renders" and path.suffix == ".png":
+        return path.stem.isdecimal()
+    return path.suffix in WRITTEN.get(top, ()) or atomic.is_stray(path.name)
 
 
 def _now() -> str:

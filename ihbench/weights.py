@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import hashlib
 import os
-import secrets
 import urllib.error
 import urllib.request
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from ihbench import registry
+from ihbench import atomic, registry
 from ihbench.errors import BadInput
 from ihbench.progress import Progress
 
@@ -82,7 +81,7 @@ def locate(weights: WeightFile) -> Path | str:
             if is_right(weights, path):
                 return path
             damaged = f"{_short(path)} is damaged or another file (its hash does not begin with {weights.sha256}); "
-    what = f"{damaged}remove it, then put the right one" if damaged else "missing; put it"
+    what = f"{damaged}move it away, then put the right one" if damaged else "missing; put it"
     return (
         f"{weights.used_by} needs {weights.file}: {what} into {_short(folders()[0])}, or on a connected machine run: "
         f"ihbench weights fetch {weights.name}"
@@ -98,35 +97,41 @@ def _short(path: Path) -> str:
 
 
 def is_right(weights: WeightFile, path: Path) -> bool:
-    """Whether a file has the hash it should have; read once per process and state of the file."""
-    about = path.stat()
-    key = str(path.resolve()), about.st_size, about.st_mtime_ns
-    if key not in _CHECKED:
-        digest = hashlib.sha256()
-        with open(path, "rb") as file:
-            while chunk := file.read(CHUNK):
-                digest.update(chunk)
-        _CHECKED[key] = digest.hexdigest().startswith(weights.sha256)
-    return _CHECKED[key]
+    """Whether a file has the hash it should have; read once per process and state of the file. One that may not be
+    read is not."""
+    try:
+        about = path.stat()
+        key = str(path.resolve()), about.st_size, about.st_mtime_ns
+        if key not in _CHECKED:
+            digest = hashlib.sha256()
+            with open(path, "rb") as file:
+                while chunk := file.read(CHUNK):
+                    digest.update(chunk)
+            _CHECKED[key] = digest.hexdigest().startswith(weights.sha256)
+        return _CHECKED[key]
+    except OSError:
+        return False
 
 
 def fetch(weights: WeightFile, progress: Progress) -> Path:
     """Download a file into the first folder, whole and with the right hash or not at all.
 
-    Raises `BadInput` when the machine is offline, the disk is full, or what came is not the file.
+    Raises `BadInput` when the machine is offline, the disk is full, what came is not the file, or another file of
+    that name is there.
     """
     there = locate(weights)
     if isinstance(there, Path):
         return there
     target = folders()[0] / weights.file
     by_hand = f"download {weights.url} elsewhere and put it into {target.parent}"
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
+    if os.path.lexists(target) and not (target.is_symlink() and not target.exists()):
+        raise BadInput(f"{target}: is damaged or another file (its hash differs); move it away, then fetch again")
     digest = hashlib.sha256()
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
         with (
             urllib.request.urlopen(weights.url, timeout=PATIENCE) as source,
-            open(temporary, "xb") as file,
+            atomic.replaced(target) as temporary,
+            open(temporary, "wb") as file,
             progress.task(f"fetching {weights.file} (MB)", round(weights.size_mb)) as task,
         ):
             done = 0
@@ -135,16 +140,13 @@ def fetch(weights: WeightFile, progress: Progress) -> Path:
                 digest.update(chunk)
                 done += len(chunk)
                 task.advance(done // 10**6 - task.done)
-        if not digest.hexdigest().startswith(weights.sha256):
-            raise BadInput(
-                f"{weights.url}: what came is not {weights.file} (its hash differs); try again, or {by_hand}"
-            )
-        os.replace(temporary, target)
+            if not digest.hexdigest().startswith(weights.sha256):
+                raise BadInput(
+                    f"{weights.url}: what came is not {weights.file} (its hash differs); try again, or {by_hand}"
+                )
     except (OSError, ValueError) as error:  # urllib's own errors are OSErrors
         reason = getattr(error, "reason", error)
         raise BadInput(f"{weights.file} could not be fetched ({reason}); {by_hand}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
     return target
 
 

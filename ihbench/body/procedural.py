@@ -12,6 +12,7 @@ follow the shape coefficients.
 
 from __future__ import annotations
 
+import io
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ihbench import atomic
 from ihbench.body.atlas import part_atlas
 from ihbench.body.procedural_surface import build_mesh
 from ihbench.body.skeleton import JOINT_INDEX, JOINT_NAMES, PARENTS
@@ -270,9 +272,11 @@ def main(arguments: list[str]) -> int:
         return 2
     out = Path(arguments[0])
     arrays = build_body()
-    np.savez_compressed(out, **arrays)  # pyright: ignore[reportArgumentType]
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)  # pyright: ignore[reportArgumentType]
+    atomic.write_bytes(out, buffer.getvalue())
     V, F = len(arrays["v_template"]), len(arrays["f"])
-    print(f"{out}: {V} vertices, {F} faces, Euler characteristic {V - F // 2}, {out.stat().st_size / 1e6:.3f} MB")
+    print(f"{out}: {V} vertices, {F} faces, Euler characteristic {V - F // 2}, {len(buffer.getvalue()) / 1e6:.3f} MB")
     return 0
 
 

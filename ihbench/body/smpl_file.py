@@ -6,6 +6,7 @@ vchoutas/smplx smplx/body_models.py and SMPL's release notes.
 
 from __future__ import annotations
 
+import io
 import re
 import zipfile
 from functools import cache
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ihbench import atomic
 from ihbench.body.atlas import part_atlas
 from ihbench.body.model import Body
 from ihbench.body.skeleton import PARENTS
@@ -254,4 +256,6 @@ def write_body(path: str | Path, body: Body) -> None:
         arrays["posedirs"] = body.posedirs
     if body.face_landmarks is not None:
         arrays["face_landmarks"] = body.face_landmarks
-    np.savez_compressed(path, **arrays)
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    atomic.write_bytes(Path(path), buffer.getvalue())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -30,6 +31,7 @@ class ExportOptions:
 
 def main(argv: list[str]) -> int:
     chosen = options(ExportOptions, argv, "export", "An avatar's Gaussians as a standard splat PLY.")
+    from ihbench.atomic import is_stream
     from ihbench.run_loop import load_avatar
     from ihbench.splat_ply import write_splat_ply
 
@@ -39,7 +41,8 @@ def main(argv: list[str]) -> int:
     means, scales, colors = avatar.gaussians(_pose(chosen.pose, avatar, open_capture))
     out = chosen.out or chosen.run / "avatar.ply"
     write_splat_ply(out, means.cpu().numpy(), scales.cpu().numpy(), colors.cpu().numpy())
-    print(f"{len(means)} Gaussians in pose {chosen.pose} written to {out}")
+    said = sys.stderr if is_stream(out) else sys.stdout  # which may be the file itself
+    print(f"{len(means)} Gaussians in pose {chosen.pose} written to {out}", file=said)
     return 0
 
 

@@ -35,7 +35,7 @@ class PrepareOptions(ProtocolChanges):
     body: Path | None = None
     """SMPL model file for real data (or IHBENCH_BODY)."""
     force: bool = False
-    """Replace what an earlier call has written."""
+    """Replace what an earlier call has written. A folder that holds anything else is left alone."""
     json: bool = False
     """Print one JSON object on stdout and nothing else there."""
 
@@ -43,8 +43,8 @@ class PrepareOptions(ProtocolChanges):
 def main(argv: list[str]) -> int:
     chosen = options(PrepareOptions, argv, "prepare", "Write the occluded training set, and nothing that it hides.")
     from ihbench import registry
-    from ihbench.data_source import locate
-    from ihbench.prepare import prepare
+    from ihbench.data_source import locate, own_body
+    from ihbench.prepare import check_target, prepare
     from ihbench.progress import Progress
     from ihbench.protocol import load_protocol
     from ihbench.views import open_scene
@@ -55,11 +55,15 @@ def main(argv: list[str]) -> int:
     layout = chosen.layout or OWN_LAYOUT.get(protocols[0].dataset, "humannerf")
     registry.entry_point("training layout", layout)
     source, progress = locate(protocols[0], chosen.data, chosen.scene), Progress()
+    sources = [path for path in (source.root, own_body(chosen.body)) if path is not None]
+    sources += [path for path in source.root.glob("*") if path.is_symlink()]  # subjects that lie elsewhere
+    for scene in source.scenes:
+        check_target(chosen.out, scene, chosen.force, sources)  # all of them before the first is written
     written = {}
     for scene in source.scenes:
         capture, body = source.open(scene, chosen.body, progress)
         opened = open_scene(capture, protocols[0])
-        written[scene] = str(prepare(opened, body, chosen.out, layout, progress, chosen.force))
+        written[scene] = str(prepare(opened, body, chosen.out, layout, progress, chosen.force, sources))
     if chosen.json:
         print(json.dumps({"layout": layout, "protocol": protocols[0].name, "scenes": written}))
     else:

@@ -100,6 +100,155 @@ def test_a_folder_or_a_file_in_the_way_is_bad_input(tmp_path):
     assert names(tmp_path) == ["file", "folder"]
 
 
+# --- what is no regular file ---
+
+
+def write_through(path: str, to: object) -> subprocess.CompletedProcess:
+    """`write_text` in a process of its own, with prints before and after, as a command has them."""
+    code = (
+        "import sys; from pathlib import Path; from ihbench import atomic\n"
+        "print('before'); atomic.write_text(Path(sys.argv[1]), 'written\\n'); print('after')"
+    )
+    return subprocess.run([sys.executable, "-c", code, path], stdout=to, stderr=subprocess.PIPE, text=True)  # pyright: ignore
+
+
+@pytest.mark.parametrize("path", ["/dev/stdout", "/dev/fd/1", "/proc/self/fd/1", "link"])
+def test_the_standard_output_is_written_into(tmp_path, path):
+    (tmp_path / "link").symlink_to("/dev/stdout")
+    path = str(tmp_path / path)
+    assert write_through(path, subprocess.PIPE).stdout == "before\nwritten\nafter\n"
+    (tmp_path / "all").write_text("earlier\n")
+    with open(tmp_path / "all", "a") as file:  # as `>>` does
+        assert write_through(path, file).returncode == 0
+    assert (tmp_path / "all").read_text() == "earlier\nbefore\nwritten\nafter\n"
+    assert (tmp_path / "link").is_symlink()
+    assert names(tmp_path) == ["all", "link"]
+
+
+def test_a_device_stays_one(tmp_path):
+    about = os.stat("/dev/null")
+    atomic.write_text(Path("/dev/null"), "x")
+    (tmp_path / "null").symlink_to("/dev/null")
+    atomic.write_text(tmp_path / "null", "x")
+    with pytest.raises(BadInput, match="disk full while writing /dev/full"):
+        atomic.write_text(Path("/dev/full"), "x")
+    assert (os.stat("/dev/null").st_rdev, os.stat("/dev/null").st_ino) == (about.st_rdev, about.st_ino)
+    assert (tmp_path / "null").is_symlink()
+
+
+def test_a_pipe_is_written_into(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with subprocess.Popen(["cat", str(tmp_path / "pipe")], stdout=subprocess.PIPE, text=True) as reader:
+        atomic.write_text(tmp_path / "pipe", "through")
+        assert reader.communicate()[0] == "through"
+    assert (tmp_path / "pipe").is_fifo()
+    assert names(tmp_path) == ["pipe"]
+
+
+def test_a_disk_and_a_socket_are_left(tmp_path, monkeypatch):
+    import socket
+
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(tmp_path / "s"))
+        with pytest.raises(BadInput, match="nobody reads there"):
+            atomic.write_text(tmp_path / "s", "x")
+    (tmp_path / "disk").write_text("partition table")
+    monkeypatch.setattr(atomic, "is_stream", lambda path: True)
+    monkeypatch.setattr(atomic.stat, "S_ISBLK", lambda mode: True)
+    with pytest.raises(BadInput, match="never written into; name a file"):
+        atomic.write_text(tmp_path / "disk", "x")
+    assert (tmp_path / "disk").read_text() == "partition table"
+
+
+def test_links_are_followed_and_stay(tmp_path):
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there" / "file").write_text("old")
+    (tmp_path / "link").symlink_to(Path("there") / "file")
+    (tmp_path / "second").symlink_to("link")
+    (tmp_path / "dangling").symlink_to(tmp_path / "new" / "folder" / "file")
+    atomic.write_text(tmp_path / "second", "new")
+    atomic.write_text(tmp_path / "dangling", "made")
+    assert (tmp_path / "there" / "file").read_text() == "new"
+    assert (tmp_path / "new" / "folder" / "file").read_text() == "made"
+    assert all((tmp_path / name).is_symlink() for name in ("link", "second", "dangling"))
+    (tmp_path / "circle").symlink_to("circle")
+    (tmp_path / "folder").symlink_to("there")
+    with pytest.raises(BadInput, match="links that lead in a circle"):
+        atomic.write_text(tmp_path / "circle", "x")
+    with pytest.raises(BadInput, match="a folder stands where"):
+        atomic.write_text(tmp_path / "folder", "x")
+    assert names(tmp_path / "there") == ["file"]
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o640, 0o755, 0o666])
+def test_a_file_keeps_its_mode_and_a_new_one_obeys_the_umask(tmp_path, mode):
+    path = tmp_path / "file"
+    path.write_text("old")
+    path.chmod(mode)
+    atomic.write_text(path, "new")
+    assert path.stat().st_mode & 0o7777 == mode
+    before = os.umask(0o027)
+    try:
+        atomic.write_text(tmp_path / "new", "x")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "new").stat().st_mode & 0o7777 == 0o640
+
+
+def test_what_replaces_a_private_file_is_private_from_the_start(tmp_path, monkeypatch):
+    path = tmp_path / "file"
+    path.write_text("old")
+    path.chmod(0o600)
+    with atomic.replaced(path) as temporary:
+        assert temporary.stat().st_mode & 0o777 == 0o600
+
+
+def test_other_names_of_a_file_keep_what_they_had(tmp_path):
+    (tmp_path / "run").write_text("old")
+    os.link(tmp_path / "run", tmp_path / "backup")
+    atomic.write_text(tmp_path / "run", "new")
+    assert [(tmp_path / name).read_text() for name in ("run", "backup")] == ["new", "old"]
+
+
+def test_a_file_whose_right_to_write_was_taken_away_is_left(tmp_path, monkeypatch):
+    path = tmp_path / "file"
+    path.write_text("old")
+    monkeypatch.setattr(os, "access", lambda *_: False)  # root may write whatever the mode
+    with pytest.raises(BadInput, match="permission denied while writing"):
+        atomic.write_text(path, "new")
+    assert path.read_text() == "old"
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_file_that_is_a_mount_of_its_own_is_written_in_place(tmp_path, monkeypatch, fails):
+    path = tmp_path / "file"
+    path.write_text("old")
+
+    def busy(*_):
+        if fails:
+            Path.write_bytes, before = (lambda *a: setattr(Path, "write_bytes", before) or full()), Path.write_bytes
+        raise OSError(errno.EBUSY, "busy")
+
+    def full():
+        raise OSError(errno.ENOSPC, "full")
+
+    monkeypatch.setattr(os, "replace", busy)
+    if fails:
+        with pytest.raises(BadInput, match="disk full"):
+            atomic.write_text(path, "new")
+    else:
+        atomic.write_text(path, "new")
+    assert path.read_text() == ("old" if fails else "new")
+    assert names(tmp_path) == ["file"]
+
+
+@pytest.mark.parametrize("path", ["", ".", "/", "/proc/nope/file", "/proc/version", "/sys/x", "x" * 300])
+def test_impossible_places_are_one_line(path):
+    with pytest.raises(BadInput) as refused:
+        atomic.write_text(Path(path), "x")
+    assert "\n" not in str(refused.value)
+
+
 # --- JSON ---
 
 VALUES = st.recursive(

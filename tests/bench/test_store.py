@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ihbench import store
+from ihbench import locks, store
 from ihbench.errors import BadInput
 from ihbench.ledger import Ledger
 from ihbench.store import RunFolder, RunIdentity
@@ -112,8 +112,8 @@ def test_force_begins_again_but_follows_no_links(tmp_path):
     (run.path / "link").symlink_to(tmp_path / "precious")
     fresh = RunFolder.create(tmp_path / "runs", IDENTITY, force=True)
     assert fresh.status == "running"
-    assert sorted(entry.name for entry in fresh.path.iterdir()) == ["lock", "run.json"]
-    assert (tmp_path / "precious" / "file").read_text() == "x"
+    assert sorted(entry.name for entry in fresh.path.iterdir()) == ["link", "lock", "run.json"]
+    assert (fresh.path / "link" / "file").read_text() == "x"
 
 
 @pytest.mark.parametrize("keep_new", [True, False])
@@ -148,10 +148,11 @@ def test_a_runs_folder_that_is_a_file_is_said(tmp_path):
         RunFolder.create(tmp_path / "file", IDENTITY, force=True)
 
 
-def test_force_does_not_empty_a_run_in_use(tmp_path):
+def test_force_does_not_empty_a_run_in_use(tmp_path, monkeypatch):
     run = RunFolder.create(tmp_path, IDENTITY)
     run.write_scores([{"a": 1}])
-    with run.lock(), pytest.raises(BadInput, match="being written"):
+    monkeypatch.setattr(locks, "WAIT", 0.0)
+    with run.lock(), pytest.raises(BadInput, match=f"being written by process {os.getpid()};"):
         RunFolder.create(tmp_path, IDENTITY, force=True)
     assert run.scores() == [{"a": 1}]
 
@@ -230,7 +231,8 @@ HOLD = (
 )
 
 
-def test_two_processes_cannot_write_one_run_and_a_dead_one_is_not_in_the_way(tmp_path):
+def test_two_processes_cannot_write_one_run_and_a_dead_one_is_not_in_the_way(tmp_path, monkeypatch):
+    monkeypatch.setattr(locks, "WAIT", 0.0)
     run = RunFolder.create(tmp_path, IDENTITY)
     with subprocess.Popen([sys.executable, "-c", HOLD, str(run.path)], stdout=subprocess.PIPE) as rival:
         assert rival.stdout is not None
@@ -239,9 +241,10 @@ def test_two_processes_cannot_write_one_run_and_a_dead_one_is_not_in_the_way(tmp
             pass
         rival.send_signal(signal.SIGKILL)
         rival.wait()
-    assert (run.path / "lock").read_text() == f"process {rival.pid}"  # what the dead one left
+    assert str(rival.pid) in (run.path / "lock.owner").read_text()  # what the dead one left
     with run.lock():
-        assert (run.path / "lock").read_text() == f"process {os.getpid()}"
+        assert str(os.getpid()) in (run.path / "lock.owner").read_text()
+    assert not (run.path / "lock.owner").exists()
 
 
 def test_a_lock_is_released_by_an_error_too(tmp_path):
@@ -259,11 +262,16 @@ def test_a_lock_is_released_by_an_error_too(tmp_path):
 def test_the_lock_shows_what_a_rival_finished_meanwhile_and_clears_its_strays(tmp_path):
     ours, rival = RunFolder.create(tmp_path, IDENTITY), RunFolder.create(tmp_path, IDENTITY)
     rival.set_status("done")
-    (ours.path / ".scores.jsonl.1.ab.tmp").write_text("half")
+    strays = [".scores.jsonl.1.0123abcd.tmp", "renders/1/.000000.png.17.89abcdef.tmp"]
+    others = [".notes.tmp", ".a.1.xyz.tmp", "renders/1/.vim.tmp"]
+    for name in (*strays, *others):
+        (ours.path / name).parent.mkdir(parents=True, exist_ok=True)
+        (ours.path / name).write_text("half")
+    (ours.path / ".folder.1.0123abcd.tmp").mkdir()
     assert not ours.finished
     with ours.lock():
         assert ours.finished
-        assert not list(ours.path.glob(".*.tmp"))
+        assert [name for name in (*strays, *others) if (ours.path / name).exists()] == others
 
 
 def test_importing_the_store_is_cheap():

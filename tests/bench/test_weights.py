@@ -122,6 +122,33 @@ def test_fetch_brings_the_whole_file_or_nothing(folder, monkeypatch, tmp_path):
     assert list(folder.iterdir()) == []
 
 
+def test_fetch_replaces_no_other_file_of_that_name(folder, monkeypatch, tmp_path):
+    source = tmp_path / "source.pth"
+    source.write_bytes(b"weights" * 1000)
+    entry = known(monkeypatch, source, source.as_uri())
+    (folder / entry.file).write_bytes(b"tuned on my own data")
+    with pytest.raises(BadInput, match="move it away, then fetch again"):
+        weights.fetch(entry, Progress.silent())
+    assert (folder / entry.file).read_bytes() == b"tuned on my own data"
+    (folder / entry.file).unlink()
+    (folder / entry.file).symlink_to(tmp_path / "store" / "weights.pth")  # a shared store, empty yet
+    assert weights.fetch(entry, Progress.silent()).is_symlink()
+    assert (tmp_path / "store" / "weights.pth").read_bytes() == source.read_bytes()
+
+
+def test_a_file_that_may_not_be_read_is_named_not_raised(folder, monkeypatch):
+    (folder / weights.FILES[SQUEEZE].file).write_bytes(b"x")
+    opened = open
+
+    def denied(path, *rest, **more):
+        if Path(path).parent == folder:
+            raise PermissionError(13, "Permission denied")
+        return opened(path, *rest, **more)
+
+    monkeypatch.setattr("builtins.open", denied)
+    assert weights.states([SQUEEZE])[0]["state"] == "damaged"
+
+
 def test_the_commands(folder, capsys):
     assert main(["weights", "list", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
 
+from ihbench import atomic
 from ihbench.errors import BadInput
 from ihbench.methods.inpainthuman.inpainting.backbone import Backbone
 from ihbench.methods.inpainthuman.inpainting.checkpoint import UnreadModule, empty_module
@@ -19,7 +21,14 @@ from ihbench.methods.inpainthuman.inpainting.text_encoder import unread_text_enc
 
 
 def save_mini(backbone: Backbone, folder: Path) -> None:
-    """Write the folder. Weights are rounded to 16 bit."""
+    """Write the folder, each file whole or not at all. Weights are rounded to 16 bit."""
+    with TemporaryDirectory() as spare:
+        _save(backbone, Path(spare))
+        for path in sorted(path for path in Path(spare).rglob("*") if path.is_file()):
+            atomic.write_bytes(folder / path.relative_to(spare), path.read_bytes())
+
+
+def _save(backbone: Backbone, folder: Path) -> None:
     for name in ("unet", "controlnet", "text_encoder", "codec"):
         part = getattr(backbone, name)
         kind = torch.float32 if name == "codec" else torch.float16

@@ -259,6 +259,5 @@ class MiniTrainer:
         self.step, self.seconds = int(meta["step"]), float(meta["seconds"])
 
     def _note(self, row: dict[str, Any]) -> None:
-        self.folder.mkdir(parents=True, exist_ok=True)
-        with (self.folder / CURVE).open("a", encoding="utf-8") as file:
-            file.write(json.dumps(row) + "\n")
+        path = self.folder / CURVE
+        atomic.write_json_lines(path, [*(atomic.read_json_lines(path) if path.is_file() else ()), row])

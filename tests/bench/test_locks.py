@@ -1,0 +1,203 @@
+"""One writer at a time: with the system's locks, without them, after kills, across machines."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+
+from ihbench import locks
+from ihbench.errors import BadInput
+from ihbench.locks import is_held, locked
+
+# errors of network file systems, of old container ones, of some FUSE ones; and a system that has locks
+KINDS = [0, errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP]
+WITHOUT = (
+    "import errno, fcntl, os\ndef refuse(*_): raise OSError({number}, os.strerror({number}))\nfcntl.flock = refuse\n"
+)
+HOLD = (
+    "import sys, time; from pathlib import Path; from ihbench.locks import locked\n"
+    "with locked(Path(sys.argv[1]), ''):\n"
+    "    print('held', flush=True); sys.stdin.read()"
+)
+
+
+@pytest.fixture(params=KINDS, ids=["locks", "ENOLCK", "ENOSYS", "ENOTSUP"])
+def kind(request, monkeypatch):
+    """Locks, or the error that a place without them answers with."""
+    monkeypatch.setattr(locks, "WAIT", 0.0)
+    if request.param:
+
+        def refuse(*_):
+            raise OSError(request.param, os.strerror(request.param))
+
+        monkeypatch.setattr(fcntl, "flock", refuse)
+    return request.param
+
+
+@pytest.fixture
+def file(tmp_path):
+    return tmp_path / "new" / "run" / "lock"
+
+
+def rival(file, kind):
+    """A process that holds until its input ends or it is killed."""
+    code = (WITHOUT.format(number=kind) if kind else "") + HOLD
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, str(file)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "held\n"
+    return process
+
+
+def refused(file):
+    with pytest.raises(BadInput, match="being written by") as error, locked(file, "go elsewhere"):
+        pass
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def test_one_at_a_time_and_released_by_an_error(file, kind):
+    def fail():
+        with locked(file, ""):
+            assert is_held(file)
+            assert f"process {os.getpid()}; wait for it to end, or go elsewhere" in refused(file)
+            raise ZeroDivisionError
+
+    for _ in range(2):
+        with pytest.raises(ZeroDivisionError):
+            fail()
+        assert not is_held(file)
+    assert [path.name for path in file.parent.iterdir()] in (["lock"], [])
+
+
+def test_another_process_is_named_and_a_dead_one_is_not_in_the_way(file, kind):
+    with rival(file, kind) as process:
+        assert is_held(file)
+        assert f"process {process.pid};" in refused(file)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    assert not is_held(file)
+    with locked(file, ""):
+        assert is_held(file)
+
+
+def test_one_that_is_about_to_end_is_waited_for(file, kind):
+    told = []
+    with rival(file, kind) as process:
+
+        def end():
+            while not told:
+                time.sleep(0.01)
+            process.kill()
+
+        thread = threading.Thread(target=end)
+        thread.start()
+        with locked(file, "", wait=60, on_wait=told.append):
+            thread.join()
+    assert told == [f"waiting for process {process.pid}, which is writing {file.parent}"]
+
+
+@pytest.mark.parametrize("words", ["", "{", "[]", '{"process": "1"}', '{"process": 1, "since": "", "place": 3}'])
+def test_a_claim_that_nobody_understands_counts_until_it_is_old(file, kind, words):
+    if not kind:
+        return_to_locks(file, words)
+        return
+    file.parent.mkdir(parents=True)
+    owner = file.with_name("lock.owner")
+    owner.write_text(words)
+    assert "another process" in refused(file)
+    os.utime(owner, (time.time() - 2 * locks.STALE,) * 2)
+    with locked(file, ""):
+        assert json.loads(owner.read_text())["process"] == os.getpid()
+
+
+def return_to_locks(file, words):
+    """Where there are locks, what the owner's file says decides nothing."""
+    file.parent.mkdir(parents=True)
+    file.with_name("lock.owner").write_text(words)
+    with locked(file, ""):
+        pass
+
+
+@pytest.mark.parametrize("kind", [errno.ENOLCK], indirect=True)
+def test_another_machine_is_believed_while_it_renews_its_claim(file, kind, monkeypatch):
+    monkeypatch.setattr(locks, "RENEWAL", 0.01)
+    owner = file.with_name("lock.owner")
+    with locked(file, ""):
+        os.utime(owner, (0, 0))
+        while owner.stat().st_mtime == 0:
+            time.sleep(0.01)
+        monkeypatch.setattr(locks, "_HERE", {"host": "other", "place": "another boot"})
+        assert is_held(file)
+        assert "on '" in refused(file)
+
+
+@pytest.mark.parametrize("kind", [errno.ENOLCK], indirect=True)
+def test_a_process_number_that_was_given_again_is_not_the_owner(file, kind):
+    file.parent.mkdir(parents=True)
+    me = json.loads(locks._write_owner(file.with_name("lock.owner"), os.O_EXCL))
+    assert is_held(file)
+    file.with_name("lock.owner").write_text(json.dumps(me | {"since": "1"}))
+    assert not is_held(file)
+    for number in (0, -1, 2**70):
+        file.with_name("lock.owner").write_text(json.dumps(me | {"process": number}))
+        assert not is_held(file)
+
+
+@pytest.mark.parametrize("kind", [errno.ENOLCK], indirect=True)
+def test_a_claim_taken_over_is_not_removed_by_the_one_who_lost_it(file, kind):
+    owner = file.with_name("lock.owner")
+    with locked(file, ""):
+        owner.write_text("somebody quicker")
+    assert owner.read_text() == "somebody quicker"
+
+
+def test_a_place_that_takes_nothing_is_one_sentence(file, kind, monkeypatch):
+    def denied(*_, **__):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(os, "open", denied)
+    with (
+        pytest.raises(BadInput, match=r"cannot be written \(.*\); go elsewhere") as error,
+        locked(file, "go elsewhere"),
+    ):
+        pass
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("place", ["/proc/nope/lock", "/sys/nope/lock"])
+def test_impossible_places(place):
+    from pathlib import Path
+
+    with pytest.raises(BadInput, match="cannot be written"), locked(Path(place), ""):
+        pass
+    assert not is_held(Path(place))
+
+
+def test_without_the_module_that_windows_lacks(file):
+    """Nothing but a lock itself asks for it, and a lock does without."""
+    code = (
+        "import sys; sys.modules['fcntl'] = None\n"
+        "import ihbench.store, ihbench.index, ihbench.recorded_run, ihbench.prepare, ihbench.cells\n" + HOLD
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(file)], input="", capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("held\n", "")
+
+
+def test_a_lock_never_writes_through_a_link(file, tmp_path):
+    (tmp_path / "precious").write_text("x")
+    file.parent.mkdir(parents=True)
+    file.with_name("lock.owner").symlink_to(tmp_path / "precious")
+    with locked(file, ""):
+        pass
+    assert (tmp_path / "precious").read_text() == "x"
