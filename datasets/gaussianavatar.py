@@ -42,6 +42,7 @@ from ihbench.datasets.people_snapshot import (
 )
 from ihbench.errors import BadInput
 from ihbench.files.pictures import encoded, one_line, read_mask, read_rgb, size_of
+from ihbench.paths import user_path
 from ihbench.scene import BodyPose
 
 SPLITS = ("train", "test")
@@ -57,7 +58,7 @@ class GaussianAvatar:
 
     def __init__(self, root: Path):
         """Raises `BadInput` when there is no such folder, or nothing of this layout in it."""
-        self.root = Path(root).expanduser()
+        self.root = user_path(root)
         wanted = f"GaussianAvatar's layout (train/ and test/ with {IMAGES}/, {MASKS}/, {CAMERA}.npz, {POSES})"
         self._folders = subject_folders(self.root, holds_gaussianavatar, wanted)
 

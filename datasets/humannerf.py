@@ -30,6 +30,7 @@ from ihbench.datasets.overlap import Overlap, overlap_of, overlap_problems
 from ihbench.datasets.pickles import write_pickle
 from ihbench.errors import BadInput
 from ihbench.files.pictures import encoded, read_mask, read_rgb, size_of
+from ihbench.paths import user_path
 from ihbench.registry import nearest
 from ihbench.safe_pickle import load_pickle
 from ihbench.scene import BodyPose
@@ -45,7 +46,7 @@ class HumanNerfFormat:
 
     def __init__(self, root: Path):
         """Raises `BadInput` when there is nothing of this layout in it."""
-        self.root = Path(root).expanduser()
+        self.root = user_path(root)
         own = [self.root.absolute()] if _is_subject(self.root) else sorted(filter(_is_subject, _folders(self.root)))
         self._folders = {folder.name: folder for folder in own}
         if not own:

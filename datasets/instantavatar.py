@@ -43,6 +43,7 @@ from ihbench.datasets.people_snapshot import (
 )
 from ihbench.errors import BadInput
 from ihbench.files.pictures import above_half, encoded, read_rgb
+from ihbench.paths import user_path
 from ihbench.safe_pickle import load_npy
 from ihbench.scene import BodyPose
 
@@ -65,7 +66,7 @@ class InstantAvatar:
 
     def __init__(self, root: Path):
         """Raises `BadInput` when there is no such folder, or nothing of this layout in it."""
-        self.root = Path(root).expanduser()
+        self.root = user_path(root)
         wanted = f"InstantAvatar's layout (images/image_0000.png, masks/, {CAMERA_FILE}, {POSES_FILE})"
         self._folders = subject_folders(self.root, holds_instantavatar, wanted)
 

@@ -36,6 +36,7 @@ from ihbench.datasets.pickles import write_pickle
 from ihbench.datasets.visible_overlap import VisibleOverlap, visible_overlap, visible_problems
 from ihbench.errors import BadInput
 from ihbench.files.pictures import encoded, read_mask, read_rgb, size_of
+from ihbench.paths import user_path
 from ihbench.registry import nearest
 from ihbench.safe_pickle import load_pickle
 from ihbench.scene import BodyPose
@@ -153,7 +154,7 @@ class OcMotionOriginal:
 
     def __init__(self, root: Path):
         """Raises `BadInput` when there is no annotation file; does not read them."""
-        self.root = Path(root).expanduser()
+        self.root = user_path(root)
         if not self.root.is_dir():
             raise BadInput(f"{self.root}: no such folder; give the folder that holds OcMotion's annot/")
         self._annots = [path for path in (self.root / "annot" / f"{split}.pkl" for split in SPLITS) if path.is_file()]

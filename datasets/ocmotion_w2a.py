@@ -42,6 +42,7 @@ from ihbench.datasets.ocmotion import (
 from ihbench.datasets.pickles import write_pickle
 from ihbench.errors import BadInput
 from ihbench.files.pictures import encoded, one_line
+from ihbench.paths import user_path
 from ihbench.registry import nearest
 from ihbench.safe_pickle import load_pickle
 from ihbench.scene import BodyPose
@@ -60,7 +61,7 @@ class OcMotionW2a:
 
     def __init__(self, root: Path):
         """Raises `BadInput` when there is no such folder, or no sequence in it."""
-        self.root = Path(root).expanduser()
+        self.root = user_path(root)
         if not self.root.is_dir():
             raise BadInput(f"{self.root}: no such folder; give the folder that holds the *{NAME_END} sequences")
         if _is_sequence(self.root.absolute()):

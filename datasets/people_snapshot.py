@@ -39,6 +39,7 @@ from ihbench.datasets.overlap import Overlap, overlap_of, overlap_problems, shar
 from ihbench.datasets.pickles import write_pickle
 from ihbench.errors import BadInput
 from ihbench.files.pictures import above_half, one_line
+from ihbench.paths import user_path
 from ihbench.registry import nearest
 from ihbench.safe_pickle import load_pickle
 from ihbench.scene import BodyPose
@@ -63,7 +64,7 @@ class PeopleSnapshotRaw:
 
     def __init__(self, root: Path):
         """Raises `BadInput` when there is no such folder, or nothing of this layout in it."""
-        self.root = Path(root).expanduser()
+        self.root = user_path(root)
         self._folders = subject_folders(
             self.root, holds_raw, f"the released PeopleSnapshot layout ({CAMERA_FILE}, {MASKS_FILE}, {POSES_FILE})"
         )

@@ -35,6 +35,7 @@ from ihbench.datasets.overlap import share_inside
 from ihbench.datasets.standin_mark import STANDIN_FILE
 from ihbench.errors import BadInput
 from ihbench.files.pictures import encoded, one_line, read_mask, read_rgb
+from ihbench.paths import user_path
 from ihbench.registry import nearest
 from ihbench.scene import BodyPose
 
@@ -57,7 +58,7 @@ class PlainScene:
 
     def __init__(self, root: Path):
         """Raises `BadInput` when there is no such folder, no scene in it, or two scenes have one name."""
-        self.root = Path(root).expanduser()
+        self.root = user_path(root)
         if not self.root.is_dir():
             raise BadInput(f"{self.root}: no such folder; give a scene folder (with {CAMERAS_FILE} in it)")
         if _is_scene(self.root):

@@ -31,6 +31,7 @@ from ihbench.datasets.overlap import Overlap, overlap_of, overlap_problems
 from ihbench.datasets.pickles import write_object
 from ihbench.errors import BadInput
 from ihbench.files.pictures import encoded, read_mask, read_rgb, size_of
+from ihbench.paths import user_path
 from ihbench.registry import nearest
 from ihbench.safe_pickle import load_npy
 from ihbench.scene import BodyPose
@@ -49,7 +50,7 @@ class ZjuMocap:
 
     def __init__(self, root: Path):
         """Raises `BadInput` when there is no such folder, or nothing of this layout in it."""
-        self.root = Path(root).expanduser()
+        self.root = user_path(root)
         if not self.root.is_dir():
             raise BadInput(f"{self.root}: no such folder; give the folder that holds {self.prefix}* folders")
         own_name = self.root.absolute().name  # "." may be a subject's folder

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import os
 import sys
+from contextlib import suppress
 from importlib import import_module
 
-from ihbench import __version__, registry
-from ihbench.errors import BadInput, Diverged
+from ihbench import __version__, registry, streams
+from ihbench.errors import BadInput
+from ihbench.failures import Failure, explained, one_line
 
 COMMANDS = {
     "run": "fit a method under a protocol, score it, print the table (the main job)",
@@ -40,7 +42,8 @@ def usage() -> str:
     lines += [
         "",
         "start here: ihbench run --protocol zju_occ --scene standin-1",
-        "exit status: 0 done, 1 a check failed or a run diverged, 2 bad input or a missing prerequisite",
+        "exit status: 0 done, 1 a check failed or a run diverged, 2 bad input or a missing prerequisite,",
+        "             3 a fault of ihbench itself (IHBENCH_DEBUG=1 prints its traceback), 130 interrupted",
     ]
     return "\n".join(lines)
 
@@ -61,40 +64,52 @@ def _bound_spinning() -> None:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run one command and return its exit status."""
+    """Run one command and return its exit status. Raises nothing: whatever goes wrong becomes one line on stderr, and
+    with `--json` one object on stdout."""
     argv = sys.argv[1:] if argv is None else argv
     _bound_spinning()
+    streams.settle()
+    try:
+        status = _run(argv)
+        sys.stdout.flush()
+        return status
+    except SystemExit as end:  # --help, and what registered commands make of bad words
+        if end.code is None or isinstance(end.code, int):
+            return end.code or 0
+        return _tell(argv, Failure(2, "bad input", one_line(str(end.code))))
+    except BaseException as error:
+        failure = explained(error)
+        if failure is None:  # the reader of our output went away (`ihbench list | head`): not an error of ours
+            streams.drop(sys.stdout)
+            return 0
+        return _tell(argv, failure)
+
+
+def _run(argv: list[str]) -> int:
     if not argv or argv[0] in ("-h", "--help", "help"):
         print(usage())
         return 0
     if argv[0] in ("-V", "--version"):
         print(__version__)
         return 0
-    as_json = "--json" in argv
-    try:
-        if argv[0] in COMMANDS:
-            return import_module(f"ihbench.commands.{argv[0]}").main(argv[1:])
-        added = registry.names("command")  # by methods and by other packages
-        if argv[0] not in added:
-            raise BadInput(f"unknown command {argv[0]!r}: {registry.nearest(argv[0], [*COMMANDS, *added])}")
-        return registry.load("command", argv[0]).main(argv[1:])
-    except BadInput as error:
-        print(f"ihbench: {error}", file=sys.stderr)
-        if as_json:
-            print(json.dumps({"status": "bad input", "error": str(error)}))
-        return 2
-    except Diverged as outcome:  # outside of a recorded run
-        print(f"ihbench: {outcome}", file=sys.stderr)
-        if as_json:
-            print(json.dumps({"status": "diverged", "error": str(outcome)}))
-        return 1
-    except KeyboardInterrupt:
-        print("ihbench: interrupted; the same command continues where it stopped", file=sys.stderr)
-        return 130
-    except BrokenPipeError:
-        # the reader of our output went away (`ihbench list | head`): not an error of ours
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+    if argv[0] in COMMANDS:
+        return import_module(f"ihbench.commands.{argv[0]}").main(argv[1:])
+    added = registry.names("command")  # by methods and by other packages
+    if argv[0] not in added:
+        raise BadInput(f"unknown command {argv[0]!r}: {registry.nearest(argv[0], [*COMMANDS, *added])}")
+    return registry.load("command", argv[0]).main(argv[1:])
+
+
+def _tell(argv: list[str], failure: Failure) -> int:
+    """Say what went wrong, wherever it can still be said."""
+    streams.say(f"ihbench: {failure.text}", sys.stderr)
+    with suppress(OSError, ValueError):
+        if "--json" in argv and streams.failure() is None:
+            print(json.dumps({"status": failure.status, "error": failure.text}))
+        sys.stdout.flush()
+    if streams.failure() is not None:
+        streams.drop(sys.stdout)
+    return failure.code
 
 
 if __name__ == "__main__":

@@ -2,32 +2,29 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
 from ihbench import registry
 from ihbench.body import Body, load_body
+from ihbench.bounds import LARGEST_CAST
 from ihbench.errors import BadInput
+from ihbench.paths import path_from, user_path
 from ihbench.progress import Progress
 from ihbench.protocol import Protocol
 from ihbench.scene import Capture
 
 STANDIN_SEED = 0
-LARGEST_CAST = 99  # people of a stand-in that can be named, whether a protocol names them or not
 
 
 def cache_folder() -> Path:
     """`IHBENCH_CACHE`, or `ihbench` in the user's cache folder."""
-    own = os.environ.get("IHBENCH_CACHE")
-    if own:
-        return Path(own)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ihbench"
+    return path_from("IHBENCH_CACHE") or (path_from("XDG_CACHE_HOME") or user_path("~/.cache", "cache")) / "ihbench"
 
 
 def own_data(data: Path | None) -> Path | None:
     """The user's copy: `--data`, else `IHBENCH_DATA`, else None. Raises `BadInput` when it is not a folder."""
-    named = data or (Path(os.environ["IHBENCH_DATA"]) if os.environ.get("IHBENCH_DATA") else None)
+    named = data or path_from("IHBENCH_DATA")
     if named is not None and not named.is_dir():
         raise BadInput(
             f"data folder {named}: does not exist; give the folder of your copy with --data or IHBENCH_DATA"
@@ -37,7 +34,7 @@ def own_data(data: Path | None) -> Path | None:
 
 def own_body(body: Path | None) -> Path | None:
     """The user's SMPL file: `--body`, else `IHBENCH_BODY`, else None."""
-    return body or (Path(os.environ["IHBENCH_BODY"]) if os.environ.get("IHBENCH_BODY") else None)
+    return body or path_from("IHBENCH_BODY")
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 from ihbench.errors import BadInput
+from ihbench.paths import user_path
 from ihbench.scene import Dataset
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ class LayoutChoice:
         return self._find(root).check(root, body)
 
     def _find(self, root: Path) -> type[Dataset]:
-        if not Path(root).expanduser().is_dir():
+        if not user_path(root).is_dir():
             raise BadInput(f"{root}: no such folder")
         complaints = []
         for name in self.layouts:

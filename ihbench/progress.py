@@ -5,6 +5,7 @@ Everything goes to stderr: stdout belongs to results.
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 import time
@@ -12,6 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TextIO
 
+from ihbench.streams import say
 from ihbench.visible_text import visible
 
 PLAIN_EVERY = 10.0  # s between two plain lines of one task
@@ -34,7 +36,7 @@ class Progress:
     ) -> None:
         if mode not in MODES:
             raise ValueError(f"progress mode: expected one of {', '.join(MODES)}, got {mode!r}")
-        self.stream = stream if stream is not None else sys.stderr
+        self.stream = stream or sys.stderr or io.StringIO()  # stderr may be closed
         if mode == "auto":
             in_ci = os.environ.get("CI", "").lower() not in ("", "0", "false")
             mode = "bar" if self.stream.isatty() and not in_ci else "plain"
@@ -68,8 +70,8 @@ class Progress:
         text = visible(text, keep="\n")
         if self._bars is not None:
             self._bars.console.print(text, markup=False, highlight=False)
-        elif self.mode != "silent":
-            print(text, file=self.stream, flush=True)
+        elif self.mode != "silent" and not say(text, self.stream):
+            self.mode = "silent"
 
     def _close(self, task: Task) -> None:
         if task.bar is not None:

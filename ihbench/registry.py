@@ -35,6 +35,14 @@ GROUPS = {
 }
 
 ROOMS = ("methods", "datasets", "protocols", "reports")  # of the bench: content, found by name
+NEEDS = {  # attributes of what is registered
+    "config": ("PROFILES", "leave_out"),
+    "command": ("SUMMARY", "main"),
+    "report verb": ("main",),
+    "dataset": ("check",),
+    "stand-in": ("version", "protocol", "subjects", "ensure", "n_frames", "n_cameras"),
+    "metric preset": ("about", "source", "measures"),
+}
 
 
 @cache
@@ -63,12 +71,36 @@ def entry_point(kind: str, name: str) -> EntryPoint:
 
 
 def load(kind: str, name: str) -> Any:
-    """Import and return the registered object. Raises `BadInput` for an unknown name or a missing package."""
+    """Import and return the registered object.
+
+    Raises `BadInput` for an unknown name, and for an object that cannot be imported, whatever its import raises, or
+    lacks what its kind needs.
+    """
     point = entry_point(kind, name)
     try:
-        return point.load()
-    except ImportError as error:
-        raise BadInput(f"{kind} {name!r} cannot be loaded: {error}") from error
+        registered = point.load()
+    except (Exception, SystemExit) as error:
+        reason = " ".join(f"{error if isinstance(error, ImportError) else repr(error)}".split())
+        raise BadInput(f"{kind} {name!r} cannot be loaded{_of(point)}: {reason}") from error
+    for attribute in NEEDS.get(kind, ()):
+        if not hasattr(registered, attribute):
+            raise BadInput(f"{kind} {name!r} cannot be used{_of(point)}: {point.value} has no {attribute}")
+    return registered
+
+
+def _of(point: EntryPoint) -> str:
+    return f" (package {point.dist.name})" if point.dist is not None else ""
+
+
+def other_packages() -> dict[str, str]:
+    """Importable package -> distribution, of everything registered that is not the bench's own."""
+    points = [point for kind in GROUPS for point in _found(kind).values()]
+    modules = {point.module.partition(".")[0]: point for point in points}
+    return {
+        module: module if point.dist is None else point.dist.name
+        for module, point in modules.items()
+        if module != "ihbench"
+    }
 
 
 def package_folder(kind: str, name: str) -> Path:

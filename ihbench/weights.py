@@ -16,6 +16,7 @@ from pathlib import Path
 
 from ihbench import atomic, registry
 from ihbench.errors import BadInput
+from ihbench.paths import path_from, user_path
 from ihbench.progress import Progress
 
 CHUNK = 2**20  # bytes
@@ -63,13 +64,9 @@ def find_weights(name: str) -> WeightFile:
 
 def folders() -> list[Path]:
     """Where weight files are looked for, in order. The last is torch's own, found without importing torch."""
-    found = []
-    own = os.environ.get("IHBENCH_WEIGHTS")
-    if own:
-        found.append(Path(own).expanduser())
-    cache = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    torch_home = Path(os.environ.get("TORCH_HOME") or Path(cache) / "torch").expanduser()
-    return [*found, torch_home / "hub" / "checkpoints"]
+    own = path_from("IHBENCH_WEIGHTS")
+    torch_home = path_from("TORCH_HOME") or (path_from("XDG_CACHE_HOME") or user_path("~/.cache", "cache")) / "torch"
+    return [*([own] if own else []), torch_home / "hub" / "checkpoints"]
 
 
 def locate(weights: WeightFile) -> Path | str:

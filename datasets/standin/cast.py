@@ -9,6 +9,7 @@ from ihbench.body import Body, load_body
 from ihbench.datasets.standin.subject import Subject
 from ihbench.datasets.standin_mark import STANDIN_FILE
 from ihbench.errors import BadInput
+from ihbench.paths import user_path
 
 NAME_PREFIX = "standin-"
 
@@ -23,7 +24,7 @@ def open_cast(root: Path, version: int, seed: int, subjects: list[str]) -> tuple
 
     Raises `BadInput` for an unknown subject, a negative seed, and a folder that holds something else.
     """
-    root = Path(root).expanduser()
+    root = user_path(root)
     if seed < 0:
         raise BadInput(f"stand-in seed {seed}: expected 0 or more")
     numbers = [member_number(subject) for subject in subjects]

@@ -22,6 +22,7 @@ from ihbench.body.model import Body
 from ihbench.body.skeleton import PARENTS
 from ihbench.body.uv_obj import read_uv_obj
 from ihbench.errors import BadInput
+from ihbench.paths import user_path
 from ihbench.safe_pickle import ForeignObject, load_pickle
 
 PROCEDURAL_FILE = Path(__file__).with_name("procedural_body.npz")
@@ -54,7 +55,7 @@ def load_body(
         if uv_path is not None or n_betas is not None:
             raise BadInput("the procedural body has its own texture coordinates and shapes; give a body file as well")
         return _procedural_body()
-    path = Path(path).expanduser()
+    path = user_path(path)
     if path.is_dir():
         path = find_model_file(path, gender)
     if not path.is_file():

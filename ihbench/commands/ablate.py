@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from ihbench import registry
+from ihbench.bounds import Within
 from ihbench.commands.device import check_device
 from ihbench.commands.keep import check_keep
 from ihbench.commands.parse import options
@@ -38,7 +39,7 @@ class AblateOptions(SceneChoice):
     """Seeds; their scores are averaged per scene before anything is compared."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to fit."""
-    workers: int | None = None
+    workers: Annotated[int | None, Within(0, 1024)] = None
     """Runs at a time, each in a process of its own; by default one per core. 0 runs them in this process."""
     share: bool = True
     """Let rungs that begin alike share what they begin with; its seconds count in each of them."""
@@ -63,8 +64,6 @@ def _ablate(chosen: AblateOptions) -> int:
         return 0
     if not chosen.seed or min(chosen.seed) < 0:
         raise BadInput(f"--seed {' '.join(map(str, chosen.seed))}: expected one number or more, each 0 or above")
-    if chosen.workers is not None and chosen.workers < 0:
-        raise BadInput(f"--workers {chosen.workers}: expected 0 or more")
     check_device(chosen.device)
     progress = Progress()
     ladder = _ladder(chosen)

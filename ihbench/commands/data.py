@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import tyro
 
 from ihbench import registry
+from ihbench.bounds import LARGEST_CAST, Within
 from ihbench.commands.parse import options
 from ihbench.errors import BadInput
 
@@ -39,7 +40,7 @@ class Standin:
     """Whose layout."""
     seed: int = 0
     """Another seed is another cast: other bodies, clothes and motions."""
-    subjects: int = 1
+    subjects: Annotated[int, Within(1, LARGEST_CAST)] = 1
     """How many people."""
     protocol: str | None = None
     """Which images: those that this protocol reads; by default the one that the stand-in is made for."""
@@ -101,8 +102,6 @@ def _standin(chosen: Standin) -> int:
     from ihbench.progress import Progress
     from ihbench.protocol import load_protocol
 
-    if chosen.subjects < 1:
-        raise BadInput(f"--subjects {chosen.subjects}: expected 1 or more")
     standin = registry.load("stand-in", chosen.dataset)
     protocol = load_protocol(chosen.protocol or standin.protocol, chosen.profile)
     if protocol.dataset != chosen.dataset:

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from ihbench.bounds import Within
 from ihbench.commands.parse import options
 
 
@@ -17,7 +18,7 @@ class KernelOptions:
     """Kernels to measure; none means all."""
     figure: Path | None = None
     """Folder for the work-precision diagram: PNG, SVG, and the numbers as CSV."""
-    repeats: int = 15
+    repeats: Annotated[int, Within(1, 10_000)] = 15
     """How often each is timed."""
     json: bool = False
     """Print one JSON object on stdout."""

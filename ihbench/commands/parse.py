@@ -1,27 +1,44 @@
-"""From arguments to a command's options dataclass."""
+"""From arguments to a command's options dataclass, checked."""
 
 from __future__ import annotations
 
 import io
 import re
+from collections.abc import Callable
 from contextlib import redirect_stderr
-from typing import TypeVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
 
+from ihbench import bounds
 from ihbench.errors import BadInput
+from ihbench.paths import user_path
+
+if TYPE_CHECKING:
+    from tyro.constructors import ConstructorRegistry
 
 Options = TypeVar("Options")
 
 BORDER = re.compile(r"\x1b\[[0-9;]*m|[│╰╯─]")  # and colours of the box that tyro draws
+RULE = re.compile(r"\W*[─-]{3}[\W]*")
+UNION = re.compile(r"no type matching .* Got errors: .*- <class '[\w.]+'>: (?!\[.*\] does not match)")
+TUPLE = re.compile(
+    r"Could not find valid parse for arguments: \[(.*?)\]; Argument helptext: (--\S+ \[?(INT|FLOAT)\b)"
+)
+SHELLS = ("bash", "zsh", "tcsh")
 
 
 def options(kind: type[Options], argv: list[str], command: str, description: str) -> Options:
-    """Parse `argv` with tyro, whose help goes to stdout with status 0. Raises `BadInput` for what it cannot parse."""
+    """Parse `argv` with tyro, whose help goes to stdout with status 0.
+
+    Raises `BadInput` for what cannot be parsed, numbers out of bounds (`ihbench.bounds`) and paths that cannot be.
+    """
     import tyro
 
+    _refuse_tyros_own(argv)
     complaint = io.StringIO()
     try:
-        with redirect_stderr(complaint):
-            return tyro.cli(
+        with redirect_stderr(complaint), _spelling():
+            chosen = tyro.cli(
                 kind,
                 args=argv,
                 prog=f"ihbench {command}",
@@ -32,10 +49,57 @@ def options(kind: type[Options], argv: list[str], command: str, description: str
         if not end.code:
             raise
         raise BadInput(f"{_in_one_line(complaint.getvalue())}; see ihbench {command} --help") from end
+    bounds.check(chosen)
+    return chosen
+
+
+def _refuse_tyros_own(argv: list[str]) -> None:
+    """tyro can print a script that completes words in a shell, and write it over any file: the latter is refused."""
+    first = argv[0].replace("_", "-") if argv else ""
+    if first == "--tyro-print-completion" and len(argv) == 2 and argv[1] not in SHELLS:
+        raise BadInput(f"{first} {argv[1]}: expected one of {', '.join(SHELLS)}")
+    if first == "--tyro-write-completion":
+        raise BadInput(f"{first}: would replace a file; send what --tyro-print-completion SHELL prints into one")
+
+
+def _spelling() -> ConstructorRegistry:
+    """How numbers, texts and paths are read: as strictly for one option as for every other."""
+    from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+
+    readers: dict[type, tuple[str, Callable[[str], Any], type | tuple[type, ...]]] = {
+        int: ("INT", bounds.whole, int),
+        float: ("FLOAT", bounds.real, (int, float)),
+        str: ("STR", bounds.plain, str),
+        Path: ("PATH", _path, Path),
+    }
+    rules = ConstructorRegistry()
+
+    @rules.primitive_rule
+    def strict(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+        if info.type not in readers:
+            return None
+        metavar, read, kinds = readers[info.type]
+        return PrimitiveConstructorSpec(
+            nargs=1,
+            metavar=metavar,
+            instance_from_str=lambda words: read(words[0]),
+            is_instance=lambda value: isinstance(value, kinds) and not isinstance(value, bool),
+            str_from_instance=lambda value: [str(value)],
+        )
+
+    return rules
+
+
+def _path(text: str) -> Path:
+    try:
+        return user_path(text)
+    except BadInput as error:  # tyro names the option
+        raise ValueError(str(error)) from error
 
 
 def _in_one_line(box: str) -> str:
     """The words of tyro's box, its parts joined by semicolons, without the title and the hint at --help."""
-    words = "".join("\n" if "───" in line else f"{line} " for line in box.splitlines() if "╭" not in line)
+    words = "".join("\n" if RULE.fullmatch(line) else f"{line} " for line in box.splitlines()[1:])
     parts = [" ".join(BORDER.sub("", part).split()).rstrip(".") for part in words.splitlines()]
-    return "; ".join(part for part in parts if part and not part.startswith("For full helptext"))
+    line = "; ".join(part for part in parts if part and not part.startswith("For full helptext"))
+    return TUPLE.sub(r"\1: expected numbers in digits 0 to 9, such as 12; \2", UNION.sub("", line))

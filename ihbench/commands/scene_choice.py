@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from ihbench import registry
+from ihbench.bounds import IMAGE_SIZES, Within
 
 if TYPE_CHECKING:
     from ihbench.protocol import Protocol
@@ -18,9 +19,9 @@ class OcclusionChoice:
 
     rule: str | None = None
     """none, fixed-strip, strip-generic, central-band, object, side, upper-half, lower-half, blocks, natural."""
-    fraction: tuple[float, ...] = ()
+    fraction: Annotated[tuple[float, ...], Within(0, 1)] = ()
     """Share of the person to hide in covered frames; several make a sweep."""
-    covers: float | None = None
+    covers: Annotated[float | None, Within(0, 1)] = None
     """Share of the training frames that are covered; all of them where the occluder stands in the scene (natural)."""
 
 
@@ -33,7 +34,7 @@ class ProtocolChanges:
     """Other training frames, START:STOP:STEP."""
     test_frames: str | None = None
     """Other (held-out) test frames, START:STOP:STEP."""
-    image_size: int | None = None
+    image_size: Annotated[int | None, Within(*IMAGE_SIZES)] = None
     """Other image size, px of the longer side, for training and test images alike."""
 
     def apply(self, protocol: Protocol) -> list[Protocol]:

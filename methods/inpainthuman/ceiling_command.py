@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from ihbench.bounds import Within
 from ihbench.commands.device import check_device
 from ihbench.errors import BadInput
 
@@ -25,7 +26,7 @@ REGIONS = ("hidden", "visible", "never_seen")
 class CeilingOptions:
     run: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
     """Folders of finished runs that painted."""
-    truth: tuple[float, ...] = (0.5, 1.0)
+    truth: Annotated[tuple[float, ...], Within(0, 1, above=True)] = (0.5, 1.0)
     """Shares of the way from the painted colours to the true ones; each costs a stage 3 per run."""
     data: Path | None = None
     """Your copy of the data set, if the runs used one."""
@@ -53,8 +54,8 @@ def _ceiling(chosen: CeilingOptions) -> int:
 
     if not chosen.run:
         raise BadInput("ceiling: of which run? give one or more run folders")
-    if not chosen.truth or not all(0 < share <= 1 for share in chosen.truth):
-        raise BadInput(f"--truth {' '.join(map(str, chosen.truth))}: expected shares above 0, at most 1")
+    if not chosen.truth:
+        raise BadInput("--truth: expected one share or more")
     check_device(chosen.device)
     results = [read_result(folder) for folder in chosen.run]
     groups = {result.group[:3] for result in results}

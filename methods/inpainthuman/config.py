@@ -8,14 +8,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+from ihbench.bounds import STEPS, MultipleOf, Within, check
 from ihbench.errors import BadInput
 from ihbench.methods.inpainthuman.inpainting.inpaint_config import PAPER_INPAINT, QUICK_INPAINT, InpaintConfig
 from ihbench.methods.inpainthuman.refine_config import PAPER_REFINE, QUICK_REFINE, RefineConfig
 from ihbench.plan import Omission, SceneMeasure
 from ihbench.weights import FILES, locate
 
+WEIGHT, RATE = Within(0, 1e6), Within(0, 1000)  # of a term of the loss; a step size
 STATIC_DEG = 5.0  # below this joint motion nothing depends on the pose
 NOTHING_HIDDEN = 0.002  # share of the texels that no frame shows although one faces them; fewer are specks
 PART_TURN = 0.05  # share of the texels that never face the camera, above which the person turns only in part
@@ -35,63 +37,63 @@ ONE_FIT_SHARE = 0.2  # more, for more steps and the SSIM
 
 @dataclass(frozen=True)
 class InpaintHumanConfig:
-    texels: int = 256
+    texels: Annotated[int, Within(8, 4096)] = 256
     """One Gaussian per texel of a square UV grid of this side: 256 gives about 50 k, 512 about 200 k."""
-    levels: tuple[int, ...] = (64, 128, 256)
+    levels: Annotated[tuple[int, ...], Within(4, 4096)] = (64, 128, 256)
     """Sides of the UV feature maps, coarse to fine (sec. 4.2). A single value gives single-scale features."""
-    channels: int = 32
+    channels: Annotated[int, Within(1, 1024)] = 32
     """Feature channels per level (sec. 4.2)."""
     fusion: Literal["sum", "concat"] = "sum"
     """How levels are joined. The paper sums; concat widens the decoder's input instead."""
-    feature_std: float = 0.01
+    feature_std: Annotated[float, Within(0, 100)] = 0.01
     """Standard deviation of the feature maps' initial values."""
     canonical_pose: Literal["a_pose", "gaussianavatar", "big_pose", "vitruvian", "t_pose"] = "a_pose"
     """Pose in which points live and are position-encoded (sec. 3.2: "A-pose")."""
-    encoding_frequencies: int = 6
+    encoding_frequencies: Annotated[int, Within(0, 32)] = 6
     """Octaves of the positional encoding of canonical points. More lets the decoder bypass the UV maps."""
-    decoder_layers: int = 3
+    decoder_layers: Annotated[int, Within(1, 64)] = 3
     """Linear layers of the decoder (sec. 4.2)."""
-    decoder_width: int = 128
+    decoder_width: Annotated[int, Within(1, 8192)] = 128
     """Hidden width of the decoder (sec. 4.2)."""
     offset: Literal["linear", "tanh"] = "linear"
     """Output form of the offset from the surface: offset_scale × output, bounded by tanh or not."""
-    offset_scale: float = 0.02
+    offset_scale: Annotated[float, Within(0, 10)] = 0.02
     """Metres per unit of the decoder's offset output (GaussianAvatar)."""
     scale_activation: Literal["softplus", "exp"] = "exp"
     """Turns the decoder's output into a factor on the initial scale."""
-    scale_initial: float = 0.7
+    scale_initial: Annotated[float, Within(0, 100, above=True)] = 0.7
     """Initial Gaussian scale as a multiple of the local texel spacing on the body."""
-    scale_limit: float = 0.02
+    scale_limit: Annotated[float, Within(0, 10, above=True)] = 0.02
     """Upper bound of a Gaussian's scale in metres."""
     pose_residual: bool = True
     """Pose-dependent residual features from the position map (sec. 3.2, dynamics)."""
-    position_map: int = 64
+    position_map: Annotated[int, Within(16, 2048), MultipleOf(8)] = 64
     """Side of the position map that the residual encoder reads (128 in the paper profile)."""
-    residual_channels: int = 16
+    residual_channels: Annotated[int, Within(4, 1024), MultipleOf(4)] = 16
     """Base width of the residual encoder (32 in the paper profile)."""
-    residual_start: float = 0.3
+    residual_start: Annotated[float, Within(0, 1)] = 0.3
     """Share of the steps after which the residual joins; earlier it would absorb what belongs to the maps."""
-    background_weight: float = 1.0
+    background_weight: Annotated[float, WEIGHT] = 1.0
     """Weight of the L1 on pixels known to be background. Without it nothing bounds the silhouette."""
-    offset_weight: float = 10.0
+    offset_weight: Annotated[float, WEIGHT] = 10.0
     """Weight of the mean squared offset in m² (GaussianAvatar)."""
-    scale_weight: float = 0.03
+    scale_weight: Annotated[float, WEIGHT] = 0.03
     """Weight of the mean scale in m (GaussianAvatar)."""
-    feature_weight: float = 1.0
+    feature_weight: Annotated[float, WEIGHT] = 1.0
     """Weight of the mean squared feature: texels nobody saw fade to zero, so that the coarse level speaks there."""
-    steps: int = 600
+    steps: Annotated[int, Within(1, STEPS)] = 600
     """Optimisation steps, one training view each."""
-    lr_maps: float = 1e-2
+    lr_maps: Annotated[float, RATE] = 1e-2
     """AdamW step size of the UV feature maps (1e-4 in the paper)."""
-    lr_decoder: float = 5e-3
+    lr_decoder: Annotated[float, RATE] = 5e-3
     """AdamW step size of the decoder (1e-4 in the paper)."""
-    lr_encoder: float = 5e-4
+    lr_encoder: Annotated[float, RATE] = 5e-4
     """AdamW step size of the residual encoder (1e-4 in the paper)."""
-    lr_final: float = 0.05
+    lr_final: Annotated[float, Within(0, 1)] = 0.05
     """Step sizes fall along a cosine to this share of their start."""
     crop: bool = True
     """While fitting, draw only the window around the body. Off: the whole image. Changes the time of a step only."""
-    clip_gradient: float = 1.0
+    clip_gradient: Annotated[float, Within(0, float("inf"), above=True)] = 1.0
     """Bound on the norm of each group's gradient."""
     cull: bool = True
     """While fitting, leave out Gaussians that the posed body hides, before they are decoded. Changes the time of a
@@ -117,24 +119,9 @@ class InpaintHumanConfig:
         return self.inpaint.on and not self.one_fit
 
     def __post_init__(self) -> None:
-        rules = (
-            ("texels", 8 <= self.texels <= 4096, "8 to 4096"),
-            ("levels", bool(self.levels) and all(4 <= r <= 4096 for r in self.levels), "one or more of 4 to 4096"),
-            ("channels", self.channels >= 1, "1 or more"),
-            ("decoder_layers", self.decoder_layers >= 1, "1 or more"),
-            ("decoder_width", self.decoder_width >= 1, "1 or more"),
-            ("encoding_frequencies", self.encoding_frequencies >= 0, "0 or more"),
-            ("position_map", self.position_map >= 16 and self.position_map % 8 == 0, "a multiple of 8, 16 or more"),
-            ("residual_channels", self.residual_channels >= 4 and self.residual_channels % 4 == 0, "a multiple of 4"),
-            ("scale_initial", self.scale_initial > 0, "above 0"),
-            ("scale_limit", self.scale_limit > 0, "above 0 m"),
-            ("steps", self.steps >= 1, "1 or more"),
-            ("clip_gradient", self.clip_gradient > 0, "above 0"),
-        )
-        for name, holds, expected in rules:
-            if not holds:
-                flag = name.replace("_", "-")
-                raise BadInput(f"--method.{flag} {getattr(self, name)}: expected {expected}")
+        check(self, "--method.")
+        if not self.levels:
+            raise BadInput("--method.levels (): expected one side or more, each 4 to 4096")
 
 
 QUICK = InpaintHumanConfig()

@@ -73,7 +73,8 @@ def test_values_that_cannot_work_are_refused_by_flag_and_value(change):
     with pytest.raises(BadInput) as caught:
         replace(QUICK, **change)
     message = str(caught.value)
-    assert message.startswith(f"--method.{name.replace('_', '-')} {value}: expected ")
+    spelled = " ".join(map(str, value)) if isinstance(value, tuple) and value else value
+    assert message.startswith(f"--method.{name.replace('_', '-')} {spelled}: expected ")
     assert "\n" not in message
 
 

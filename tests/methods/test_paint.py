@@ -53,7 +53,7 @@ def test_the_table_has_intervals_and_the_full_methods_lead(painted):
     ("words", "complaint"),
     [
         (("--rows", "temporel"), "did you mean 'temporal'"),
-        (("--frames", "0"), "expected 1 or more"),
+        (("--frames", "0"), "--frames 0: expected 1 to 100000"),
         (("--occlusion.rule", "none", "--rows", "mean", "--scene", "standin-1"), "no training frame hides anything"),
     ],
 )

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from ihbench.errors import BadInput
+from ihbench.paths import user_path
 
 PICKLES = (".bin", ".ckpt", ".pt", ".pth", ".pkl")
 VARIANTS = ("", ".fp16", ".bf16")
@@ -29,7 +30,7 @@ Rename = Callable[[str], str | None]
 
 def find_folder(where: str, option: str) -> Path:
     """The folder itself, or the cached snapshot of a hub id. `option` is what the user set, for the message."""
-    folder = Path(where).expanduser()
+    folder = user_path(where)
     if folder.is_dir():
         return folder
     if folder.is_file():

@@ -33,6 +33,7 @@ from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
 from ihbench.methods.inpainthuman.inpainting.memory import said_when_full
 from ihbench.methods.inpainthuman.inpainting.part_map import smpl_parts
 from ihbench.methods.inpainthuman.inpainting.quiet_libraries import quiet_libraries
+from ihbench.paths import user_path
 
 RIM = 0.03  # of the body's height in the crop: how far outside of the posed body the painted image decides
 # of the body's height: farther inside it all is person. A fitted body is about so exact; people stand out from the
@@ -242,7 +243,7 @@ def _points_on_parts(parts: NDArray[np.uint8]) -> list[tuple[float, float]]:
 
 def check_sam(weights: str) -> Path:
     """The folder, after what a look can tell. Raises `BadInput`, see `SamSilhouette`."""
-    folder = Path(weights).expanduser()
+    folder = user_path(weights)
     if not weights or not folder.is_dir():
         raise BadInput(f"{SAM_OPTION} {weights!r}: no such folder; {SAM_LAYOUT}")
     if not (folder / "config.json").is_file():

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+from ihbench.bounds import STEPS, Within, check
 from ihbench.errors import BadInput
 
 TOKEN = "<someone>"
@@ -50,49 +51,49 @@ class InpaintConfig:
     the model is asked, also while the word is learned."""
     token: str = TOKEN
     """The new word V*."""
-    vectors: int | None = None
+    vectors: Annotated[int | None, Within(1, 64)] = None
     """Word vectors of V*. None: 4 for mini, which was trained with so many; 1 for sd2, as in the paper."""
-    ti_steps: int = 80
+    ti_steps: Annotated[int, Within(1, STEPS)] = 80
     """Steps of textual inversion."""
-    ti_lr: float | None = None
+    ti_lr: Annotated[float | None, Within(0, 1000, above=True)] = None
     """AdamW step size of the word vectors. None: 2e-2 for mini; 5e-4 for sd2, as in diffusers' recipe."""
-    ti_frames: float = 0.2
+    ti_frames: Annotated[float, Within(0, 1, above=True)] = 0.2
     """Share of the frames, the best seen, that textual inversion learns from."""
     text_lora: bool = False
     """Adapt the text encoder by LoRA during textual inversion, the paper's "jointly fine-tune"."""
-    lora_steps: int = 100
+    lora_steps: Annotated[int, Within(1, STEPS)] = 100
     """Steps of the adaptation."""
     tune: Literal["lora", "all"] | None = None
     """What the adaptation changes in the UNet: LoRA on its attention (the paper), or every weight. None: all for
     mini, which gains more from it; lora for sd2."""
-    rank: int = 8
+    rank: Annotated[int, Within(1, 1024)] = 8
     """Rank of LoRA, and its alpha (sec. 4.2)."""
-    lora_lr: float | None = None
+    lora_lr: Annotated[float | None, Within(0, 1000, above=True)] = None
     """AdamW step size of LoRA, or of every weight. None: 1e-4 for sd2, for mini 3e-4 (1e-3 with LoRA)."""
-    control_lr: float | None = None
+    control_lr: Annotated[float | None, Within(0, 1000, above=True)] = None
     """AdamW step size of the ControlNet. None: 3e-4 for mini, 1e-5 for sd2."""
-    batch: int = 8
+    batch: Annotated[int, Within(1, 4096)] = 8
     """Crops a step, halved when memory runs out."""
-    sampler_steps: int | None = None
+    sampler_steps: Annotated[int | None, Within(1, 1000)] = None
     """DDIM steps. None: 6 for mini, 50 for sd2."""
-    noise: float | None = None
+    noise: Annotated[float | None, Within(0, 100)] = None
     """Scale of the noise that sampling starts from. None: 1 for sd2; 0 for mini, whose colours follow strong noise:
     its mean answer is the better one."""
-    guidance: float | None = None
+    guidance: Annotated[float | None, Within(1, 1000)] = None
     """Classifier-free guidance against the empty prompt; 1 is none. None: 1 for mini, 5 for sd2."""
     context: Literal["seen", "frame"] = "seen"
     """What the inpainter is shown besides visible pixels. "seen": hidden pixels whose surface another frame shows are
     drawn by the stage-1 avatar, and only what no frame shows is painted. "frame": the frame alone, as the paper."""
-    trust: float = 0.8
+    trust: Annotated[float, Within(0, 1)] = 0.8
     """Weight of the painter's colours; the rest is the stage-1 avatar's own guess, which errs differently. 1: the
     painter alone (the paper). With context "seen" only."""
-    facing: float = 0.0
+    facing: Annotated[float, Within(0, 0.999)] = 0.0
     """Only surface is painted that faces some training view, hidden, by at least this cosine; what all views would
     see at a glancing angle keeps stage 1's colours. 0: all of it (the paper). The plan takes 0.5 where the person
     turns only in part; where they turn fully that is worse. With context "seen"."""
-    key_views: int = 40
+    key_views: Annotated[int, Within(0, 100_000)] = 40
     """Frames painted at most, chosen to see all of the surface that needs it; 0 for every frame that sees some."""
-    turntable: int = 0
+    turntable: Annotated[int, Within(0, 10_000)] = 0
     """Views of the stage-1 avatar, all around it, inpainted too: the only way to surface that never faced the camera.
     A departure from the paper; needs context "seen"."""
     silhouette: Literal["coverage", "grabcut", "sam"] = "coverage"
@@ -104,21 +105,8 @@ class InpaintConfig:
     """sd2: checkpointed gradients, the autoencoder in slices and tiles: less memory, more time."""
 
     def __post_init__(self) -> None:
+        check(self, "--method.inpaint.")
         rules = (
-            ("vectors", self.vectors is None or self.vectors >= 1, "1 or more"),
-            ("ti_steps", self.ti_steps >= 1, "1 or more"),
-            ("ti_frames", 0 < self.ti_frames <= 1, "above 0, at most 1"),
-            ("lora_steps", self.lora_steps >= 1, "1 or more"),
-            ("rank", self.rank >= 1, "1 or more"),
-            ("batch", self.batch >= 1, "1 or more"),
-            ("sampler_steps", self.sampler_steps is None or 1 <= self.sampler_steps <= 1000, "1 to 1000"),
-            *((name, _rate(getattr(self, name)), "above 0") for name in ("ti_lr", "lora_lr", "control_lr")),
-            ("noise", self.noise is None or 0 <= self.noise < float("inf"), "0 or more"),
-            ("guidance", self.guidance is None or self.guidance >= 1, "1 or more"),
-            ("trust", 0 <= self.trust <= 1, "0 to 1"),
-            ("facing", 0 <= self.facing < 1, "0 or more, below 1"),
-            ("key_views", self.key_views >= 0, "0 or more"),
-            ("turntable", self.turntable >= 0, "0 or more"),
             (
                 "turntable",
                 not self.turntable or self.context == "seen",
@@ -150,10 +138,6 @@ class InpaintConfig:
     def names_something(self) -> bool:
         """Whether the user has named what may be wrong: weights, or a word."""
         return bool(self.weights or self.control_weights) or self.token != TOKEN
-
-
-def _rate(value: float | None) -> bool:
-    return value is None or 0 < value < float("inf")
 
 
 SAM_WANTED = "the folder of HQ-SAM in transformers' layout, which silhouette sam needs"

@@ -8,6 +8,7 @@ from typing import Any
 from ihbench.errors import BadInput
 from ihbench.methods.inpainthuman.inpainting.checkpoint import CONVERT, has_pickles, read_json, weight_files
 from ihbench.methods.inpainthuman.inpainting.text_encoder import TEXT_STEM
+from ihbench.paths import user_path
 
 SHIPPED = Path(__file__).parent / "mini"
 STEM = "diffusion_pytorch_model"
@@ -20,7 +21,7 @@ HOW = "`ihbench train-mini --out DIR` makes one"
 def check_mini(folder: Path) -> tuple[Path, dict[str, dict[str, Any]]]:
     """The folder and its parts' configurations. Raises `BadInput` for one that lacks a part, has pickles for weights,
     or holds another model, such as Stable Diffusion."""
-    folder = Path(folder).expanduser()
+    folder = user_path(folder)
     missing = [name for name in PARTS if not (folder / name).is_dir()]
     if missing:
         raise BadInput(f"{folder}: not a mini backbone, lacks {', '.join(missing)}; {HOW}")

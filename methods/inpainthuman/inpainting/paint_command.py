@@ -8,8 +8,9 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+from ihbench.bounds import Within
 from ihbench.commands.device import check_device
 from ihbench.commands.scene_choice import ProtocolChanges
 from ihbench.errors import BadInput
@@ -27,7 +28,7 @@ class PaintOptions(ProtocolChanges):
     """Scenes; none means all that the protocol names. Stand-ins may be any standin-1, standin-2, …"""
     rows: tuple[str, ...] = ROWS
     """Painters to compare."""
-    frames: int = 20
+    frames: Annotated[int, Within(1, 100_000)] = 20
     """Training frames painted, evenly spread; personalisation sees all."""
     seed: tuple[int, ...] = (0,)
     """Seeds; their scores are averaged per scene before anything else."""
@@ -67,8 +68,8 @@ def _paint(chosen: Any) -> int:
     for row in chosen.rows:
         if row not in ROWS:
             raise BadInput(f"--rows {row}: {registry.nearest(row, list(ROWS))}")
-    if chosen.frames < 1 or not chosen.seed:
-        raise BadInput(f"--frames {chosen.frames}, {len(chosen.seed)} seeds: expected 1 or more of both")
+    if not chosen.seed:
+        raise BadInput("--seed: expected one number or more")
     protocols = chosen.apply(load_protocol(chosen.protocol, chosen.profile))
     if len(protocols) > 1:
         raise BadInput("--occlusion.fraction: one severity at a time")

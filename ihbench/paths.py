@@ -1,0 +1,42 @@
+"""A path as a user wrote it, on the command line, in a variable or from Python."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from ihbench.errors import BadInput
+
+LONGEST_NAME, LONGEST_PATH = 255, 4095  # bytes; what common file systems and Linux take
+
+
+def user_path(words: str | os.PathLike[str], what: str = "path") -> Path:
+    """The path with `~` resolved. Raises `BadInput` for one that no file can have, and for an unknown user's home.
+
+    `what` says where the words come from, such as "IHBENCH_DATA".
+    """
+    text = os.fspath(words)
+    if not text:
+        raise BadInput(f"{what} '': expected a path, found no text; leave the option out, or write . for this folder")
+    if "\0" in text:
+        raise BadInput(f"{what} {text!r}: holds a zero byte, which no path can have")
+    sizes = [len(os.fsencode(part)) for part in text.split(os.sep)]
+    if max(sizes) > LONGEST_NAME or sum(sizes) + len(sizes) > LONGEST_PATH:
+        longest = f"a name of {max(sizes)} bytes in a path of {sum(sizes) + len(sizes) - 1}"
+        raise BadInput(
+            f"{what} {text[:60]}…: {longest}; expected names up to {LONGEST_NAME}, paths up to {LONGEST_PATH}"
+        )
+    path = Path(text)
+    try:
+        return path.expanduser()
+    except RuntimeError as error:
+        user = path.parts[0].removeprefix("~")
+        if user:
+            raise BadInput(f"{what} {text}: no user {user!r} here; a folder of that name is ./{text}") from error
+        raise BadInput(f"{what} {text}: this user has no home folder; set HOME, or write the path in full") from error
+
+
+def path_from(variable: str) -> Path | None:
+    """The path in an environment variable; None where it is not set or empty. Raises `BadInput` as `user_path`."""
+    words = os.environ.get(variable)
+    return user_path(words, variable) if words else None

@@ -1,0 +1,91 @@
+"""Standard output and error wherever the bench runs: closed, full, without a reader, in a poor encoding."""
+
+from __future__ import annotations
+
+import codecs
+import io
+import os
+import sys
+from contextlib import suppress
+from typing import TextIO
+
+
+def _escaped(error: UnicodeError) -> tuple[str, int]:
+    r"""What an encoding lacks, as \uXXXX: unlike Python's own escapes that is what JSON calls it, too."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    units = error.object[error.start : error.end].encode("utf-16-be", "surrogatepass")
+    return "".join(f"\\u{units[k : k + 2].hex()}" for k in range(0, len(units), 2)), error.end
+
+
+codecs.register_error("ihbench.escaped", _escaped)
+
+
+class Stdout(io.TextIOWrapper):
+    """Standard output that remembers why it could not be written: the exception itself does not name its file."""
+
+    failure: OSError | None = None
+
+    def __init__(self, plain: io.TextIOWrapper):
+        options = {"line_buffering": plain.line_buffering, "write_through": plain.write_through}
+        super().__init__(plain.buffer, plain.encoding, plain.errors, **options)
+        self.plain = plain  # would close what both write to when nobody held it
+
+    def write(self, text: str, /) -> int:
+        try:
+            return super().write(text)
+        except OSError as error:
+            self.failure = error
+            raise
+
+    def flush(self) -> None:
+        try:
+            super().flush()
+        except OSError as error:
+            self.failure = error
+            raise
+
+
+def settle() -> None:
+    """Make both streams bear any text, and put the null device in the place of what is closed.
+
+    Otherwise the next file that is opened would get the number of the closed stream, and everything that is printed.
+    """
+    for number in (0, 1, 2):
+        try:
+            os.fstat(number)
+        except OSError:
+            with suppress(OSError):
+                os.open(os.devnull, os.O_RDWR)  # the lowest free number: this one
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 (as long as the process)
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="ihbench.escaped")
+    out = sys.stdout
+    if type(out) is io.TextIOWrapper:  # not what tests and notebooks put there
+        sys.stdout = Stdout(out)
+
+
+def failure() -> OSError | None:
+    """Why stdout cannot be written, where that has happened."""
+    return getattr(sys.stdout, "failure", None)
+
+
+def drop(stream: TextIO) -> None:
+    """Let what is still in a stream go nowhere, so that the end of the process does not complain of it."""
+    with suppress(OSError, ValueError):
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, stream.fileno())
+        os.close(null)
+
+
+def say(text: str, stream: TextIO) -> bool:
+    """Print a line on stderr. What nobody can read must not end what it tells of: False when it cannot be printed."""
+    try:
+        print(text, file=stream, flush=True)
+    except (OSError, ValueError):  # full, without a reader, closed
+        drop(stream)
+        return False
+    return True
