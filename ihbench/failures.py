@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from ihbench import registry, streams
 from ihbench.errors import BadInput, Diverged
+from ihbench.visible_text import visible
 
 DEBUG = "IHBENCH_DEBUG"  # environment variable: print tracebacks, too
 REPORT_TO = "please report it with that traceback"
@@ -57,7 +58,7 @@ def out_of_memory(error: BaseException) -> bool:
 
 
 def one_line(text: str) -> str:
-    return " ".join(text.split())
+    return visible(" ".join(text.split()))
 
 
 def system_words(error: OSError) -> str:
