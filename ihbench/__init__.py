@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from ihbench.threads import bound_spinning
+
 __version__ = "0.2.0"
 __all__ = ["load_scene", "run"]
+
+bound_spinning()  # whoever comes in, by whichever module, comes by here, and mostly before torch
 
 if TYPE_CHECKING:
     from ihbench.run_loop import load_scene, run

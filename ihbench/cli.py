@@ -56,18 +56,10 @@ def _summary(name: str) -> str:
         return str(error)
 
 
-def _bound_spinning() -> None:
-    """Let torch's OpenMP threads go to sleep soon when they have nothing to do. By default they spin for long, which
-    on a machine that is busy with something else made a fit two to four times slower. Must come before torch."""
-    if "OMP_WAIT_POLICY" not in os.environ:
-        os.environ.setdefault("GOMP_SPINCOUNT", "10000")
-
-
 def main(argv: list[str] | None = None) -> int:
     """Run one command and return its exit status. Raises nothing: whatever goes wrong becomes one line on stderr, and
     with `--json` one object on stdout."""
     argv = sys.argv[1:] if argv is None else argv
-    _bound_spinning()
     streams.settle()
     try:
         status = _run(argv)

@@ -17,7 +17,6 @@ from unittest.mock import patch
 
 import pytest
 
-os.environ.setdefault("GOMP_SPINCOUNT", "10000")  # as the command line does; before anything imports torch
 if "PYTEST_XDIST_WORKER" in os.environ:  # a process a core: more threads would only wait for each other
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
