@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from functools import cached_property
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ihbench.body import Body, load_body
+from ihbench.camera import Camera
 from ihbench.datasets.standin_mark import standin_mark
 from ihbench.errors import BadInput
+from ihbench.scene import BodyPose
 
 
-class CaptureFolder:
+class CaptureFolder(ABC):
     """One subject's folder. A format adds what `ihbench.scene.Capture` asks for."""
 
     n_frames: int
@@ -64,6 +70,26 @@ class CaptureFolder:
     def files_of(self, camera: int, frame: int, source: str) -> tuple[Path, ...]:
         """The picture files of one view. Formats whose frames share files have none."""
         return ()
+
+    @abstractmethod
+    def camera(self, camera: int) -> Camera: ...
+
+    @abstractmethod
+    def body_pose(self, frame: int) -> BodyPose: ...
+
+    @abstractmethod
+    def image(self, camera: int, frame: int) -> NDArray[np.uint8]: ...
+
+    @abstractmethod
+    def silhouette(self, camera: int, frame: int, source: str = "mask") -> NDArray[np.bool_]: ...
+
+    def stored_pose(self, frame: int) -> BodyPose:
+        """The numbers of a frame as the files hold them, whatever their root convention: needs no body model."""
+        return self.body_pose(frame)
+
+    def label(self, frame: int) -> str:
+        """What the files call a frame."""
+        return str(frame)
 
     def check_index(self, camera: int, frame: int) -> None:
         """Raise `BadInput` for a camera or frame that the capture does not have."""

@@ -26,8 +26,8 @@ from ihbench import atomic
 from ihbench.body import Body, from_zju_root, zju_root
 from ihbench.camera import Camera
 from ihbench.datasets.capture_folder import CaptureFolder
-from ihbench.datasets.overlap import Overlap, overlap_of, overlap_problems
 from ihbench.datasets.pickles import write_pickle
+from ihbench.datasets.plausibility import Outline, examine
 from ihbench.errors import BadInput
 from ihbench.files.pictures import encoded, read_mask, read_rgb, size_of
 from ihbench.paths import user_path
@@ -260,7 +260,7 @@ def check(dataset: HumanNerfFormat, body: Body | None = None, samples: int = 4) 
                 "missing": missing,
             }  # fmt: skip
             problems += [f"{n} of {kind} missing" for kind, n in missing.items() if n]
-            _sample(capture, views, samples, found, problems)
+            _examine(capture, [view for view in views if not capture.lacks(*view)], samples, found)
         except BadInput as error:
             problems.append(str(error))
         subjects.append(found)
@@ -279,26 +279,14 @@ def _fitting(dataset: HumanNerfFormat, name: str, body: Body | None) -> Body | N
     return None if dataset.open(name).standin else body
 
 
-def _sample(
-    capture: HumanNerfCapture, views: list[tuple[int, int]], samples: int, found: dict, problems: list[str]
-) -> None:
-    overlaps: list[Overlap] = []
-    for k in sorted({int(k) for k in np.linspace(0, len(views) - 1, samples)}):
-        camera, frame = views[k]
-        try:
-            height, width, _ = capture.image(camera, frame).shape
-            found["image_size"] = [[width, height]]
-            mask = capture.silhouette(camera, frame)
-            if not capture.has_model:
-                continue  # poses need the SMPL file
-            points = capture.camera(camera).project(capture.model.pose(capture.body_pose(frame)))
-        except BadInput as error:
-            problems.append(str(error))
-            continue
-        overlaps.append(overlap_of(points, mask))
-    if overlaps:
-        found["vertices_in_mask"] = round(float(np.mean([o.inside for o in overlaps])), 4)
-        problems += overlap_problems(overlaps)
+def _examine(capture: HumanNerfCapture, views: list[tuple[int, int]], samples: int, found: dict[str, Any]) -> None:
+    model = capture.model if capture.has_model else None
+
+    def outline(frame: int) -> Outline:
+        assert model is not None
+        return Outline(model.pose(capture.body_pose(frame)), model.faces)
+
+    examine(capture, views, found, whole=True, outline=outline if model else None, samples=samples)
 
 
 # ----------------------------------------------------------------------------------------------- write

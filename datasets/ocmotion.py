@@ -16,7 +16,7 @@ Source: boycehbz/CHOMP vis_OcMotion.py. What the `_w2a` sequences share with thi
 from __future__ import annotations
 
 import hashlib
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -31,9 +31,8 @@ from ihbench import atomic
 from ihbench.body import Body
 from ihbench.camera import Camera
 from ihbench.datasets.capture_folder import CaptureFolder
-from ihbench.datasets.overlap import share_inside
 from ihbench.datasets.pickles import write_pickle
-from ihbench.datasets.visible_overlap import VisibleOverlap, visible_overlap, visible_problems
+from ihbench.datasets.plausibility import Outline, examine
 from ihbench.errors import BadInput
 from ihbench.files.pictures import encoded, read_mask, read_rgb, size_of
 from ihbench.paths import user_path
@@ -52,7 +51,7 @@ LARGEST_ROTATION = 4 * np.pi  # rad of one joint; a fit may wind once around, de
 LISTED_PROBLEMS = 5  # of one kind, then "and so on"
 
 
-class OneCameraCapture(CaptureFolder, ABC):
+class OneCameraCapture(CaptureFolder):
     """A person before one fixed camera, one image and one visible mask a frame. Keeps no images."""
 
     dataset = "ocmotion"
@@ -111,6 +110,9 @@ class OneCameraCapture(CaptureFolder, ABC):
 
     def files_of(self, camera: int, frame: int, source: str) -> tuple[Path, ...]:
         return self.image_path(camera, frame), self.mask_path(camera, frame)
+
+    def label(self, frame: int) -> str:
+        return self.frame_names[frame]
 
     def image_path(self, camera: int, frame: int) -> Path:
         self.check_index(camera, frame)
@@ -463,8 +465,8 @@ def check(root: Path, body: Body | None = None, samples: int = 3) -> dict[str, A
 def checked(dataset: _Sequences, body: Body | None = None, samples: int = 3) -> dict[str, Any]:
     """What a copy is and what it lacks, for `ihbench data check`.
 
-    Lists files, reads every pose, decodes `samples` frames a subject. `mask_in_body` is the share of the visible
-    masks that lies on the projected body, over the sampled frames: below 0.9 means masks that are mirrored or
+    Lists files, reads every pose, decodes `samples` frames a subject. `mask_on_body` is the share of the visible
+    masks that lies on the projected body, over the frames looked at: well below 0.9 means masks that are mirrored or
     inverted, or wrong cameras, units or parameters. `vertices_in_mask` is for information, since furniture hides
     vertices. Both need the body model: a stand-in has its own, real captures need `body`, the SMPL model.
     """
@@ -521,7 +523,13 @@ def _check_subject(dataset: _Sequences, name: str, samples: int, body: Body | No
         problems.append(f"and so on: the body's parameters are unusable at {len(unreadable)} frames")
     complete = sorted(there["image"] & there["mask"])
     if complete:
-        _sample(capture, complete, poses, samples, model, found, problems)
+
+        def outline(frame: int) -> Outline:
+            assert model is not None
+            return Outline(model.pose(capture.body_pose(frame)), model.faces)
+
+        views = [(0, frame) for frame in complete if frame in poses]
+        examine(capture, views, found, whole=False, outline=outline if model else None, samples=samples)
     else:
         problems.append("no image with its mask found")
     return found
@@ -529,47 +537,6 @@ def _check_subject(dataset: _Sequences, name: str, samples: int, body: Body | No
 
 def _listing(folders: set[Path]) -> set[Path]:
     return {path for folder in folders if folder.is_dir() for path in folder.iterdir()}
-
-
-def _sample(
-    capture: OneCameraCapture,
-    complete: list[int],
-    poses: dict[int, BodyPose],
-    samples: int,
-    body: Body | None,
-    found: dict[str, Any],
-    problems: list[str],
-) -> None:
-    """Decode a few frames and compare their masks with the projected body."""
-    from scipy.ndimage import binary_dilation
-
-    overlaps: list[VisibleOverlap] = []
-    inside, sizes, n_decoded, n_empty = [], set(), 0, 0
-    for frame in sorted({complete[i] for i in np.linspace(0, len(complete) - 1, samples).astype(int)}):
-        try:
-            height, width, _ = capture.image(0, frame).shape
-            sizes.add((width, height))
-            silhouette = capture.silhouette(0, frame)
-            camera = capture.camera(0)
-            vertices = body.pose(poses[frame]) if body is not None and frame in poses else None
-        except BadInput as error:
-            problems.append(str(error))
-            continue
-        n_decoded += 1
-        n_empty += not silhouette.any()
-        if body is None or vertices is None or not silhouette.any():
-            continue
-        grown = np.asarray(binary_dilation(silhouette, iterations=max(1, width // 100)), bool)
-        inside.append(share_inside(camera.project(vertices), grown))
-        overlaps.append(visible_overlap(body, poses[frame], camera, silhouette))
-    found["sampled_images"] = n_decoded
-    found["image_size"] = sorted([list(size) for size in sizes])
-    if overlaps:
-        found["vertices_in_mask"] = round(float(np.mean(inside)), 4)
-        found["mask_in_body"] = round(float(np.mean([overlap.inside for overlap in overlaps])), 4)
-        problems += visible_problems(overlaps)
-    if n_decoded and n_empty == n_decoded:
-        problems.append("the masks of all sampled frames are empty; expected non-zero where the person is seen")
 
 
 # ----------------------------------------------------------------------------------------------- write

@@ -35,8 +35,8 @@ from ihbench.body import Body
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera
 from ihbench.datasets.capture_folder import CaptureFolder
-from ihbench.datasets.overlap import Overlap, overlap_of, overlap_problems, share_inside
 from ihbench.datasets.pickles import write_pickle
+from ihbench.datasets.plausibility import Outline, examine, share_inside
 from ihbench.errors import BadInput
 from ihbench.files.pictures import above_half, one_line
 from ihbench.paths import user_path
@@ -596,26 +596,14 @@ def checked(dataset: Any, body: Body | None, inspect: Callable[[Any, dict[str, A
 
 def sample_frames(capture: Any, frames: Sequence[int], samples: int, found: dict[str, Any]) -> None:
     """Decode a few of the frames and project the body into their silhouettes; adds the result to `found`."""
-    overlaps: list[Overlap] = []
-    sizes, decoded = set(), 0
-    problems = found["problems"]
-    for frame in sorted({frames[i] for i in np.linspace(0, len(frames) - 1, samples).astype(int)} if frames else ()):
-        try:
-            height, width, _ = capture.image(0, frame).shape
-            sizes.add((width, height))
-            silhouette = capture.silhouette(0, frame)
-            decoded += 1
-            if capture.has_model:
-                points = capture.camera(0).project(capture.model.pose(capture.body_pose(frame)))
-                overlaps.append(overlap_of(points, silhouette))
-        except BadInput as error:
-            if str(error) not in problems:
-                problems.append(str(error))
-    found["sampled_images"] = decoded
-    found["image_size"] = sorted([list(size) for size in sizes])
-    if overlaps:
-        found["vertices_in_mask"] = round(float(np.mean([overlap.inside for overlap in overlaps])), 4)
-        problems += overlap_problems(overlaps)
+    model = capture.model if capture.has_model else None
+
+    def outline(frame: int) -> Outline:
+        assert model is not None
+        return Outline(model.pose(capture.body_pose(frame)), model.faces)
+
+    views = [(0, frame) for frame in frames]
+    examine(capture, views, found, whole=True, outline=outline if model else None, samples=samples)
 
 
 def spoiled_rows(*arrays: NDArray) -> list[int]:

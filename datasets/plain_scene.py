@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import math
 import re
 import tempfile
 import zipfile
@@ -31,7 +30,7 @@ from ihbench.body import Body, from_zju_root, load_body, write_body, zju_root
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera
 from ihbench.datasets.capture_folder import CaptureFolder
-from ihbench.datasets.overlap import share_inside
+from ihbench.datasets.plausibility import Outline, examine
 from ihbench.datasets.standin_mark import STANDIN_FILE
 from ihbench.errors import BadInput
 from ihbench.files.pictures import encoded, one_line, read_mask, read_rgb
@@ -48,9 +47,7 @@ POSE_KEYS = ("frames", "pose", "betas", "transl", "root")
 ROOTS = ("smpl", "zju")
 LARGEST_ENTRY = 2**28  # bytes of one array in poses.npz: 460 000 frames
 JPEG_QUALITY = 95
-FARTHEST, NEAREST = 100, 0.05  # m, plausible median depth of a body
 SMPL_PELVIS = (0.0, -0.24, 0.03)  # m, about, in SMPL's rest pose; only `check` uses it
-CHECK_SIZE = 256  # px, longest side at which `check` compares silhouettes
 
 
 class PlainScene:
@@ -143,7 +140,7 @@ class PlainCapture(CaptureFolder):
     def body_pose(self, frame: int) -> BodyPose:
         """The frame's SMPL parameters in the standard root convention."""
         self.check_index(0, frame)
-        stored = self._poses.row(frame)
+        stored = self.stored_pose(frame)
         if self._poses.root == "smpl":
             return stored
         pose = stored.pose.copy()
@@ -179,6 +176,13 @@ class PlainCapture(CaptureFolder):
         if not all(found):
             raise BadInput(f"{self.folder}: no image or mask of frame {number}")
         return tuple(path for paths in found for path in paths)
+
+    def stored_pose(self, frame: int) -> BodyPose:
+        self.check_index(0, frame)
+        return self._poses.row(frame)
+
+    def label(self, frame: int) -> str:
+        return str(self.number(frame))
 
     def number(self, frame: int) -> int:
         """The number that the frame's files carry."""
@@ -419,42 +423,16 @@ def _read_npz(path: Path) -> dict[str, NDArray]:
 # ----------------------------------------------------------------------------------------------- check
 
 
-@dataclass
-class _Overlap:
-    """How the body's silhouette and one mask lie on each other, the mask as stored and turned about."""
-
-    vertices_in_mask: float
-    mask_on_body: float
-    iou: dict[str, float]  # by how the mask was changed: "" for as stored
-    full: bool  # the mask covers everything
-
-
-CHANGES = {
-    "": lambda mask: mask,
-    "inverted": lambda mask: ~mask,
-    "mirrored": lambda mask: mask[:, ::-1],
-    "upside down": lambda mask: mask[::-1],
-    "rotated": lambda mask: mask[::-1, ::-1],
-}
-ADVICE = {
-    "inverted": "the masks look inverted; expected non-zero for the person, 0 for the rest",
-    "mirrored": "pictures and geometry are mirrored left to right; flip the pictures or the geometry's x axis",
-    "upside down": "pictures and geometry are upside down to each other; expected OpenCV axes, y down",
-    "rotated": "pictures and geometry are turned by 180° to each other; expected OpenCV axes, x right, y down",
-}
-CLEARLY = 0.2  # how much more overlap tells that a change is the right one
-
-
 def check(root: Path, samples: int = 3, body: Body | None = None) -> dict[str, Any]:
     """What these scenes hold and lack, for `ihbench data check`.
 
-    Lists folders, projects the body of `samples` frames into every camera, and compares it with the masks of up to
-    four cameras. Without `body` (the SMPL model of the poses) and body.npz, the bench's own body in mean shape
-    stands for SMPL ("body_used"): good for units, axes and flips. Raises `BadInput` when the root is no scene folder;
-    what is wrong with a scene is in its "problems". `vertices_in_mask` is the share of body vertices that project
-    into the silhouette (grown by 1 %), `mask_on_body` the share of the silhouette on the (grown) body; an occluded
-    person has less of the former, wrong cameras, units or poses less of both. A person who stands upright in the
-    middle of a picture has no mirror image to tell apart.
+    Lists folders and holds the body against masks of up to four cameras (`plausibility.examine`). Without `body` (the
+    SMPL model of the poses) and body.npz, the bench's own body in mean shape stands for SMPL ("body_used"): good for
+    units, axes and flips. Raises `BadInput` when the root is no scene folder; what is wrong with a scene is in its
+    "problems", what may be wrong in its "warnings". `vertices_in_mask` is the share of body vertices that project
+    into the silhouette (grown by 1 %), `mask_on_body` the share of the silhouette on the body (grown by 3 % of its
+    height); an occluded person has less of the former, wrong cameras, units or poses less of both. A person who
+    stands upright in the middle of a picture has no mirror image to tell apart.
     """
     dataset = PlainScene(root)
     subjects = [_check_subject(dataset, name, samples, body) for name in dataset.subjects()]
@@ -487,12 +465,19 @@ def _check_subject(dataset: PlainScene, name: str, samples: int, body: Body | No
     }
     _check_files(capture, found, problems)
     try:
-        posed = _posed(capture, samples, found)
+        outline, exact = _outlines(capture, found)
     except BadInput as error:
         problems.append(str(error))
         return found
-    aimed = _check_geometry(capture, posed, problems)
-    _check_pictures(capture, posed, aimed, found, problems)
+    views = [
+        (camera, frame)
+        for camera in range(len(capture.camera_ids))
+        for frame in range(capture.n_frames)
+        if not capture.lacks(camera, frame)
+    ]
+    if not views:
+        problems.append("no image with its mask and pose found")
+    examine(capture, views, found, whole=None, outline=outline, exact=exact, samples=samples)
     return found
 
 
@@ -538,13 +523,8 @@ def _check_files(capture: PlainCapture, found: dict[str, Any], problems: list[st
             problems += [f"{folder / stray}: {CAMERAS_FILE} has no camera of this name" for stray in strays]
 
 
-def _posed(capture: PlainCapture, samples: int, found: dict[str, Any]) -> dict[int, tuple[Array, NDArray[np.int32]]]:
-    """Frame -> (vertices [V, 3] m, faces) of a few frames, of SMPL or of the bench's body in its place."""
-    frames = sorted(set(np.linspace(0, capture.n_frames - 1, samples).astype(int).tolist()))
-    with_pictures = set.intersection(*(set(capture.files(k, 0)) for k in ("images", "masks")))
-    complete = [frame for frame in range(capture.n_frames) if capture.number(frame) in with_pictures]
-    if complete:
-        frames = sorted({complete[i] for i in np.linspace(0, len(complete) - 1, samples).astype(int)})
+def _outlines(capture: PlainCapture, found: dict[str, Any]) -> tuple[Callable[[int], Outline], bool]:
+    """The body of a frame, of SMPL or of the bench's body in its place, and whether it is the former."""
     try:
         model = capture.model
     except BadInput:
@@ -552,136 +532,18 @@ def _posed(capture: PlainCapture, samples: int, found: dict[str, Any]) -> dict[i
             raise
         found["body_used"] = "procedural, in SMPL's place"
         model = load_body()
-        return {frame: (model.pose(_like_smpl(capture, frame, model)), model.faces) for frame in frames}
+        return lambda frame: Outline(model.pose(_like_smpl(capture, frame, model)), model.faces), False
     found["body_used"] = model.name
-    return {frame: (model.pose(capture.body_pose(frame)), model.faces) for frame in frames}
+    return lambda frame: Outline(model.pose(capture.body_pose(frame)), model.faces), True
 
 
 def _like_smpl(capture: PlainCapture, frame: int, model: Body) -> BodyPose:
     """The pose that puts the bench's mean body where SMPL's mean body is."""
-    stored = capture._poses.row(frame)
+    stored = capture.stored_pose(frame)
     pelvis = np.array(SMPL_PELVIS)
     if capture._poses.root == "zju":
         pelvis = axis_angle_to_matrix(stored.pose[0]) @ pelvis
     return BodyPose(stored.pose, np.zeros(1), stored.transl + pelvis - model.joints[0])
-
-
-def _check_geometry(
-    capture: PlainCapture, posed: dict[int, tuple[Array, NDArray[np.int32]]], problems: list[str]
-) -> list[int]:
-    """Report cameras with implausible units or without the body in view; return the others."""
-    far, near, blind, good = [], [], [], []
-    for camera in range(len(capture.camera_ids)):
-        view = capture.camera(camera)
-        points = np.concatenate([view.project(vertices) for vertices, _ in posed.values()])
-        depth = float(np.median(points[:, 2]))
-        if abs(depth) > FARTHEST:
-            far.append((camera, depth))
-        elif abs(depth) < NEAREST:
-            near.append((camera, depth))
-        elif share_inside(points, np.ones((view.height, view.width), bool)) == 0:
-            blind.append((camera, depth))
-        else:
-            good.append(camera)
-    for group, text in (
-        (far, f"more than {FARTHEST} m: t or transl look like millimetres; expected metres, divide by 1000"),
-        (
-            near,
-            f"less than {NEAREST} m: t or transl are not in metres, or one of them is missing",
-        ),
-    ):
-        if group:
-            problems.append(f"{_named(capture, group)}: the body is {group[0][1]:.3g} m in front of it, {text}")
-    if blind:
-        depth = blind[0][1]
-        where = (
-            f"{-depth:.3g} m behind it: expected R, t from world to camera, with OpenCV axes (z forward)"
-            if depth < 0
-            else f"{depth:.3g} m in front of it, out of the picture: check K, R, t and the frames of the poses"
-        )
-        problems.append(f"{_named(capture, blind)}: sees no body in the sampled frames; it is {where}")
-    return good
-
-
-def _named(capture: PlainCapture, group: list[tuple[int, float]]) -> str:
-    names = ", ".join(capture.camera_ids[camera] for camera, _ in group[:5])
-    return f"camera{'s' * (len(group) > 1)} {names}{'…' * (len(group) > 5)}"
-
-
-def _check_pictures(
-    capture: PlainCapture,
-    posed: dict[int, tuple[Array, NDArray[np.int32]]],
-    aimed: list[int],
-    found: dict[str, Any],
-    problems: list[str],
-) -> None:
-    """Decode a few images and compare their masks with the body's silhouette."""
-    overlaps: list[_Overlap] = []
-    sizes, n_images = set(), 0
-    n_cameras = len(capture.camera_ids)
-    for camera in sorted({int(i) for i in np.linspace(0, n_cameras - 1, min(4, n_cameras))}):
-        for frame, (vertices, faces) in posed.items():
-            number = capture.number(frame)
-            if number not in capture.files("images", camera) or number not in capture.files("masks", camera):
-                continue
-            try:
-                height, width, _ = capture.image(camera, frame).shape
-                mask = capture.silhouette(camera, frame)
-            except BadInput as error:
-                problems.append(str(error))
-                continue
-            n_images += 1
-            sizes.add((width, height))
-            if not mask.any():
-                problems.append(f"{capture.files('masks', camera)[number][0]}: shows no person, all is 0")
-            elif camera in aimed:
-                overlaps.append(_overlap(capture.camera(camera), vertices, faces, mask))
-    found["sampled_images"] = n_images
-    found["image_size"] = sorted([list(size) for size in sizes])
-    if not n_images:
-        problems.append("no image with its mask and pose found")
-    if not overlaps:
-        return
-    inside = found["vertices_in_mask"] = round(float(np.mean([o.vertices_in_mask for o in overlaps])), 4)
-    covered = found["mask_on_body"] = round(float(np.mean([o.mask_on_body for o in overlaps])), 4)
-    if all(overlap.full for overlap in overlaps):
-        problems.append("the masks cover whole pictures; expected 0 where the person is not (alpha is ignored)")
-        return
-    iou = {change: float(np.mean([o.iou[change] for o in overlaps])) for change in CHANGES}
-    best = max(iou, key=lambda change: iou[change])
-    exact = found["body_used"] != "procedural, in SMPL's place"
-    if best and iou[best] > iou[""] + CLEARLY:
-        problems.append(f"{ADVICE[best]} (overlap {iou['']:.0%} as stored, {iou[best]:.0%} {best})")
-    elif inside < (0.95 if exact else 0.7) and covered < (0.7 if exact else 0.5):
-        problems.append(
-            f"only {inside:.0%} of the body's vertices project into the silhouettes and only {covered:.0%} of the "
-            f"silhouettes lie on the body; expected over 95 %, or silhouettes on the body where it is occluded"
-        )
-
-
-def _overlap(view: Camera, vertices: Array, faces: NDArray[np.int32], mask: NDArray[np.bool_]) -> _Overlap:
-    from scipy.ndimage import binary_dilation
-
-    from ihbench.render.zbuffer import rasterize
-
-    shrink = min(1.0, CHECK_SIZE / max(view.width, view.height))
-    width, height = max(1, math.ceil(view.width * shrink)), max(1, math.ceil(view.height * shrink))
-    rows = ((np.arange(height) + 0.5) * view.height / height).astype(int)
-    columns = ((np.arange(width) + 0.5) * view.width / width).astype(int)
-    mask = mask[rows][:, columns]
-    points = view.scaled(width, height).project(vertices)
-    person = rasterize(points, faces, height, width).mask
-    grow = max(1, width // 100)
-    iou = {}
-    for name, change in CHANGES.items():
-        changed = change(mask)
-        iou[name] = float((changed & person).sum()) / max(1, int((changed | person).sum()))
-    return _Overlap(
-        vertices_in_mask=share_inside(points, np.asarray(binary_dilation(mask, iterations=grow), bool)),
-        mask_on_body=float(np.asarray(binary_dilation(person, iterations=grow))[mask].mean()) if mask.any() else 0.0,
-        iou=iou,
-        full=bool(mask.mean() > 0.98),
-    )
 
 
 # ----------------------------------------------------------------------------------------------- write

@@ -27,8 +27,8 @@ from ihbench import atomic
 from ihbench.body import Body, from_zju_root, zju_root
 from ihbench.camera import Camera
 from ihbench.datasets.capture_folder import CaptureFolder
-from ihbench.datasets.overlap import Overlap, overlap_of, overlap_problems
 from ihbench.datasets.pickles import write_object
+from ihbench.datasets.plausibility import Outline, examine
 from ihbench.errors import BadInput
 from ihbench.files.pictures import encoded, read_mask, read_rgb, size_of
 from ihbench.paths import user_path
@@ -68,7 +68,7 @@ class ZjuMocap:
     @staticmethod
     def check(root: Path, body: Body | None = None) -> dict[str, Any]:
         """What this copy is and what it lacks; see `check` below."""
-        return check(ZjuMocap(root), "original")
+        return check(ZjuMocap(root), "original", body)
 
     def subjects(self) -> list[str]:
         """Names without `CoreView_`, in natural order."""
@@ -170,6 +170,13 @@ class ZjuCapture(CaptureFolder):
     def files_of(self, camera: int, frame: int, source: str) -> tuple[Path, ...]:
         masks = (self.mask_path(camera, frame, kind) for kind in SILHOUETTES.get(source, ()))
         return (self.image_path(camera, frame), *masks)
+
+    def stored_pose(self, frame: int) -> BodyPose:
+        poses, shapes, Rh, Th = read_params(self.params_path(frame))
+        return BodyPose(np.concatenate([Rh, poses[-69:]]).reshape(24, 3), shapes, Th)
+
+    def label(self, frame: int) -> str:
+        return str(self.number(frame))
 
     def number(self, frame: int) -> int:
         """The number that the frame's parameter and vertex files carry; 313 and 315 count from 1."""
@@ -365,7 +372,7 @@ def _shape_of(array: NDArray) -> str:
 # ----------------------------------------------------------------------------------------------- check
 
 
-def check(dataset: ZjuMocap, layout: str, samples: int = 3) -> dict[str, Any]:
+def check(dataset: ZjuMocap, layout: str, body: Body | None = None, samples: int = 3) -> dict[str, Any]:
     """What this copy is and what it lacks, for `ihbench data check`.
 
     Lists folders and decodes `samples` frames of two cameras a subject; it does not decode everything. Raises
@@ -373,7 +380,7 @@ def check(dataset: ZjuMocap, layout: str, samples: int = 3) -> dict[str, Any]:
     `vertices_in_mask` is the share of body vertices that project into the person's silhouette (grown by 1 % of the
     image's width), over the sampled images: well below 0.95 means wrong cameras, units or parameters.
     """
-    subjects = [_check_subject(dataset, name, samples) for name in dataset.subjects()]
+    subjects = [_check_subject(dataset, name, body, samples) for name in dataset.subjects()]
     return {
         "dataset": ZjuCapture.dataset,
         "layout": layout,
@@ -384,11 +391,13 @@ def check(dataset: ZjuMocap, layout: str, samples: int = 3) -> dict[str, Any]:
     }
 
 
-def _check_subject(dataset: ZjuMocap, name: str, samples: int) -> dict[str, Any]:
+def _check_subject(dataset: ZjuMocap, name: str, body: Body | None, samples: int) -> dict[str, Any]:
     problems: list[str] = []
     found: dict[str, Any] = {"subject": name, "problems": problems}
     try:
         capture = dataset.open(name)
+        if body is not None and not capture.standin:
+            capture = dataset.open(name, body)
     except BadInput as error:
         problems.append(str(error))
         return found
@@ -419,7 +428,7 @@ def _check_subject(dataset: ZjuMocap, name: str, samples: int) -> dict[str, Any]
     if not capture.standin:
         problems += [f"{n} of {what} missing" for what, n in missing.items() if n and what != "mask_cihp"]
     if complete:
-        _sample(capture, complete, samples, found, problems)
+        examine(capture, complete, found, whole=True, outline=lambda frame: _outline(capture, frame), samples=samples)
     else:
         problems.append("no image with its mask found")
     return found
@@ -429,31 +438,12 @@ def _listing(folders: Iterable[Path]) -> set[Path]:
     return {path for folder in folders if folder.is_dir() for path in folder.iterdir()}
 
 
-def _sample(
-    capture: ZjuCapture, complete: list[tuple[int, int]], samples: int, found: dict[str, Any], problems: list[str]
-) -> None:
-    """Decode a few images of the first and last camera, and project the body into their masks."""
-    overlaps: list[Overlap] = []
-    sizes, decoded_images = set(), 0
-    for camera in sorted({complete[0][0], complete[-1][0]}):
-        frames = [frame for other, frame in complete if other == camera]
-        for frame in sorted({frames[i] for i in np.linspace(0, len(frames) - 1, samples).astype(int)}):
-            try:
-                height, width, _ = capture.image(camera, frame).shape
-                sizes.add((width, height))
-                silhouette = capture.silhouette(camera, frame)
-                read_params(capture.params_path(frame))
-                points = capture.camera(camera).project(capture.vertices(frame))
-            except BadInput as error:
-                problems.append(str(error))
-                continue
-            decoded_images += 1
-            overlaps.append(overlap_of(points, silhouette))
-    found["sampled_images"] = decoded_images
-    found["image_size"] = sorted([list(size) for size in sizes])
-    if overlaps:
-        found["vertices_in_mask"] = round(float(np.mean([o.inside for o in overlaps])), 4)
-        problems += overlap_problems(overlaps)
+def _outline(capture: ZjuCapture, frame: int) -> Outline:
+    """The frame's body: posed where the model is at hand, else its stored vertices."""
+    read_params(capture.params_path(frame))
+    if capture.has_model:
+        return Outline(capture.model.pose(capture.body_pose(frame)), capture.model.faces)
+    return Outline(capture.vertices(frame))
 
 
 # ----------------------------------------------------------------------------------------------- write

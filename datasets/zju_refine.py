@@ -36,7 +36,7 @@ class ZjuRefine(ZjuMocap):
 
     @staticmethod
     def check(root: Path, body: Body | None = None) -> dict[str, Any]:
-        return zju_mocap.check(ZjuRefine(root), "refine")
+        return zju_mocap.check(ZjuRefine(root), "refine", body)
 
     def _capture(self, folder: Path, body: Body | None) -> ZjuCapture:
         return ZjuRefineCapture(folder, body)

@@ -431,7 +431,7 @@ def test_standin_takes_its_own_body_and_may_lack_images(sequence):
     assert found["ok"]
     (subject,) = found["subjects"]
     assert subject["missing"] == {"image": 1, "mask": 0}
-    assert subject["mask_in_body"] > 0.95
+    assert subject["mask_on_body"] > 0.95
 
 
 # --------------------------------------------------------------------------------------- w2a: bad input
@@ -774,7 +774,7 @@ def test_check_of_a_sound_sequence(w2a, smpl):
     assert subject["files"] == {"image": N_FRAMES, "mask": N_FRAMES}
     assert subject["missing"] == {"image": 0, "mask": 0}
     assert (subject["sampled_images"], subject["image_size"]) == (3, [[WIDTH, HEIGHT]])
-    assert subject["mask_in_body"] > 0.99
+    assert subject["mask_on_body"] > 0.99
     assert subject["vertices_in_mask"] < 0.9  # the furniture hides the rest
     json.dumps(found)
 
@@ -782,7 +782,7 @@ def test_check_of_a_sound_sequence(w2a, smpl):
 def test_check_without_a_body_says_nothing_about_the_masks(w2a):
     (subject,) = OcMotionW2a.check(w2a.root)["subjects"]
     assert subject["problems"] == []
-    assert "mask_in_body" not in subject
+    assert "mask_on_body" not in subject
 
 
 @pytest.mark.parametrize(
@@ -790,8 +790,8 @@ def test_check_without_a_body_says_nothing_about_the_masks(w2a):
     [
         (lambda mask: mask[:, ::-1], "look mirrored"),
         (lambda mask: ~mask, "look inverted"),
-        (lambda mask: np.roll(mask, 40, 0), "of the masks' pixels lie on the projected body"),
-        (lambda mask: 0 * mask, "masks of all sampled frames are empty"),
+        (lambda mask: np.roll(mask, 40, 0), "of the silhouettes lie on the body"),
+        (lambda mask: 0 * mask, "the masks show no person"),
     ],
 )
 def test_check_names_masks_that_do_not_fit(sequence, w2a, smpl, change, expected):
@@ -807,7 +807,7 @@ def test_check_notices_poses_of_other_frames(sequence, w2a, smpl):
     moved = [dataclasses.replace(pose, transl=pose.transl - np.array([0.5, 0, 0])) for pose in w2a.poses]
     ocmotion_w2a.write_sequence_metadata(sequence, NAMES, w2a.cameras[OWN], moved)
     (subject,) = OcMotionW2a.check(sequence.parent, smpl)["subjects"]
-    assert subject["mask_in_body"] < 0.9
+    assert subject["mask_on_body"] < 0.9
     assert len(subject["problems"]) == 1
 
 

@@ -607,7 +607,7 @@ def each_mask(folder, change):
         (lambda mask: mask[::-1, ::-1].copy(), "turned by 180°"),
         (lambda mask: np.full_like(mask, 255), "cover whole pictures"),
         (lambda mask: np.roll(mask, 25, 1), "of the body's vertices project into the silhouettes"),
-        (lambda mask: np.zeros_like(mask), "shows no person"),
+        (lambda mask: np.zeros_like(mask), "show no person"),
     ],
 )
 def test_check_names_wrong_masks(change, text, copy):
@@ -615,7 +615,7 @@ def test_check_names_wrong_masks(change, text, copy):
     problems = problems_of(copy)
     assert problems
     assert all(text in problem for problem in problems)
-    assert len(problems) == (6 if "no person" in text else 1)
+    assert len(problems) == 1
 
 
 def test_check_accepts_an_occluded_person(copy):
