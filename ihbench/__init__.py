@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from ihbench.kernel_cache import choose_kernel_cache
 from ihbench.threads import bound_spinning
 
 __version__ = "0.2.0"
 __all__ = ["load_scene", "run"]
 
+choose_kernel_cache()  # before numba
 bound_spinning()  # whoever comes in, by whichever module, comes by here, and mostly before torch
 
 if TYPE_CHECKING:

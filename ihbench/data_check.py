@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from ihbench.camera import Camera
     from ihbench.scene import BodyPose
 
+OVERLAYS = Path("data_check")
 OVERLAY_HEIGHT = 480  # px
 OVERLAY_FRAMES = 3
 BODY_LINE, MASK_LINE = (0, 220, 255), (255, 60, 60)  # RGB: the projected body, the mask
@@ -81,19 +82,27 @@ def _outlined(
     return out
 
 
-def add_fitness(found: dict[str, Any], root: Path, body: Body | None, overlays: Path | None) -> None:
-    """Extend a check's result: per subject "protocols" (name -> fitness) and "overlay" (a file, or why none)."""
+def add_fitness(found: dict[str, Any], root: Path, body: Body | None, named: Path | None) -> None:
+    """Extend a check's result: per subject "protocols" (name -> fitness) and "overlay" (a file, or why none).
+
+    `named` is the folder for overlays, None for the usual one.
+    """
     from ihbench.contact_sheet import write_png
 
-    if overlays is not None and overlays.resolve().is_relative_to(root.resolve()):
-        raise BadInput(f"--overlays {overlays}: lies in the data folder, which is never written to; name another")
+    no_place = ""
+    overlays = OVERLAYS if named is None else named
+    if overlays.resolve().is_relative_to(root.resolve()):
+        if named is not None:
+            raise BadInput(f"--overlays {named}: lies in the data folder, which is never written to; name another")
+        no_place = "none: the current folder is in the data folder, never written to; name one with --overlays"
     protocols = protocols_of(found["dataset"])
     source = registry.load("dataset", found["dataset"])(root)
     for subject in found["subjects"]:
         try:
             capture = source.open(subject["subject"])
             subject["protocols"] = {protocol.name: fitness(capture, protocol) for protocol in protocols}
-            if overlays is None:
+            if no_place:
+                subject["overlay"] = no_place
                 continue
             if capture.body == "smpl" and body is None:
                 subject["overlay"] = "none: needs the SMPL model file, name it with --body or IHBENCH_BODY"
@@ -110,5 +119,8 @@ def add_fitness(found: dict[str, Any], root: Path, body: Body | None, overlays: 
             subject["overlay"] = "none: no frame has image, mask and pose"
             continue
         path = overlays / f"{subject['subject']}.png"
-        write_png(path, picture)
-        subject["overlay"] = str(path)
+        try:
+            write_png(path, picture)
+            subject["overlay"] = str(path)
+        except (BadInput, OSError) as error:  # the check is worth having without a picture
+            subject["overlay"] = no_place = f"none: {error}; name another folder with --overlays"

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
 from ihbench.errors import BadInput
 
+UNSET = re.compile(r"\$(\w+|\{\w+\})")
 LONGEST_NAME, LONGEST_PATH = 255, 4095  # bytes; what common file systems and Linux take
 
 
 def user_path(words: str | os.PathLike[str], what: str = "path") -> Path:
-    """The path with `~` resolved. Raises `BadInput` for one that no file can have, and for an unknown user's home.
+    """The path with `~` and `$VARIABLES` resolved, as a shell does. Raises `BadInput` for one that no file can have,
+    for an unknown user's home, and for a variable that is not set, unless the path exists as it stands.
 
     `what` says where the words come from, such as "IHBENCH_DATA".
     """
@@ -26,6 +29,11 @@ def user_path(words: str | os.PathLike[str], what: str = "path") -> Path:
         raise BadInput(
             f"{what} {text[:60]}…: {longest}; expected names up to {LONGEST_NAME}, paths up to {LONGEST_PATH}"
         )
+    if "$" in text and not os.path.lexists(text):
+        text = os.path.expandvars(text)
+        unset = UNSET.search(text)
+        if unset and not os.path.lexists(text):
+            raise BadInput(f"{what} {text}: the variable {unset[0]} is not set; set it, or write the path in full")
     path = Path(text)
     try:
         return path.expanduser()

@@ -18,14 +18,16 @@ from ihbench.errors import BadInput
 
 @dataclass(frozen=True)
 class Check:
-    """Name the layout and variant found in a folder, and what is missing. Changes nothing."""
+    """Name the layout and variant found in a folder, what is missing (problems) and what is suspicious (warnings).
+
+    Changes nothing. Status 0 also with warnings, 1 with problems."""
 
     folder: Annotated[Path, tyro.conf.Positional]
     """The data folder."""
     body: Path | None = None
     """SMPL model file for real data (or IHBENCH_BODY): poses are then held against the masks."""
-    overlays: Path = Path("data_check")
-    """Folder for a picture of each subject with the body's outline on its images."""
+    overlays: Path | None = None
+    """Folder for a picture of each subject with the body's outline on its images; by default data_check."""
     json: bool = False
     """Print one JSON object on stdout."""
 
@@ -60,22 +62,22 @@ def main(argv: list[str]) -> int:
 
 
 def _check(chosen: Check) -> int:
-    if not chosen.folder.is_dir():
-        raise BadInput(f"data folder {chosen.folder}: does not exist")
     from ihbench.body import load_body
     from ihbench.data_check import add_fitness
-    from ihbench.data_source import body_file, own_body
+    from ihbench.data_source import body_file, own_body, own_data
 
+    folder = own_data(chosen.folder)
+    assert folder is not None
     named = own_body(chosen.body)
     body = None if named is None else load_body(body_file(named, "neutral"))
     complaints = []
     for name in registry.names("dataset"):
         try:
-            found = registry.load("dataset", name).check(chosen.folder, body)
+            found = registry.load("dataset", name).check(folder, body)
         except BadInput as error:
             complaints.append(f"{name}: {error}")
             continue
-        add_fitness(found, chosen.folder, body, chosen.overlays)
+        add_fitness(found, folder, body, chosen.overlays)
         print(json.dumps(found, ensure_ascii=False) if chosen.json else "\n".join(_lines(found)))
         return 0 if found["ok"] else 1
     raise BadInput(f"data folder {chosen.folder}: no known layout ({'; '.join(complaints)})")
@@ -91,6 +93,8 @@ def _lines(value: Any, indent: str = "") -> Iterator[str]:
             for entry in item:
                 yield f"{indent}{key.removesuffix('s')}:"
                 yield from _lines(entry, indent + "  ")
+        elif key in ("problems", "warnings") and item:
+            yield from (f"{indent}{key.removesuffix('s')}: {line}" for line in item)
         elif isinstance(item, list):
             yield f"{indent}{key}: {', '.join(map(str, item)) or 'none'}"
         else:

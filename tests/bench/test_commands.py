@@ -247,6 +247,26 @@ def test_data_check_names_what_is_wrong_and_returns_1(bench, tmp_path):
     assert contents(copy) == before
 
 
+def test_data_check_does_without_a_picture_where_none_may_be_written(bench, tmp_path, monkeypatch):
+    with bench.in_its_world():
+        copy = shutil.copytree(standin_root("zju_mocap"), tmp_path / "copy")
+    before = contents(copy)
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "data_check").touch()
+    for place, reason in (("copy", "the current folder is in the data folder"), ("elsewhere", "a file stands where")):
+        monkeypatch.chdir(tmp_path / place)
+        outcome = bench("data", "check", copy)
+        assert outcome.status == 0, outcome
+        assert f"overlay: none: {reason}" in outcome.out
+    assert contents(copy) == before
+    monkeypatch.setenv("SOMEWHERE", str(tmp_path))
+    assert bench("data", "check", "$SOMEWHERE/copy/", "--overlays", tmp_path / "seen").status == 0
+    for named in ("$SOMEWHERE/none", "~nobody_of_that_name", "$NOT_SET_AT_ALL/x"):
+        outcome = bench("data", "check", named)
+        assert (outcome.status, outcome.out) == (2, "")
+        assert len(outcome.err.splitlines()) == 1
+
+
 def test_data_check_of_a_folder_without_a_known_layout(bench, tmp_path):
     (tmp_path / "empty").mkdir()
     outcome = bench("data", "check", tmp_path / "empty")
