@@ -62,7 +62,7 @@ def write_bytes(path: Path, data: bytes, durable: bool = True) -> None:
     try:
         stream = _stream(path)
         if stream is not None:
-            with stream:
+            with suppress(BrokenPipeError), stream:  # who reads no further has had enough
                 stream.write(data)
             return
     except OSError as error:

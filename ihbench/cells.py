@@ -1,10 +1,11 @@
-"""Many runs side by side, each in a process of its own: one that fails, or is killed, takes no other along."""
+"""Many runs side by side, each in a process of its own: one that fails, or is killed, takes no other along. When the
+process that started them ends, however it does, so do they."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
@@ -13,6 +14,7 @@ from typing import Any
 
 from ihbench.data_source import DataSource
 from ihbench.errors import BadInput
+from ihbench.interruption import GRACE, end_with_parent, interruptible, reason_of
 from ihbench.progress import Progress
 from ihbench.results import RunResult, read_result
 from ihbench.run_loop import RunRequest, run_scene
@@ -108,6 +110,8 @@ def _side_by_side(
         for _, process in running.values():
             process.terminate()
         for _, process in running.values():
+            process.join(2 * GRACE)  # they record how they ended
+            process.kill()
             process.join()
 
 
@@ -131,20 +135,24 @@ def _outcome(cell: Cell, connection: Connection, process: Any) -> CellOutcome:
 
 
 def _child(connection: Connection, request: RunRequest, source: DataSource, scene: str, threads: int) -> None:
-    import cv2
-    import torch
+    end_with_parent()
+    folder, problem = None, ""
+    with interruptible():
+        try:
+            import cv2
+            import torch
 
-    torch.set_num_threads(threads)
-    cv2.setNumThreads(threads)
-    try:
-        result = run_scene(request, source, scene, Progress.silent())
-    except BadInput as error:
-        connection.send((None, str(error)))
-    except KeyboardInterrupt:
-        connection.send((None, "interrupted"))
-    else:
-        connection.send((str(result.folder), ""))
-    connection.close()
+            torch.set_num_threads(threads)
+            cv2.setNumThreads(threads)
+            folder = str(run_scene(request, source, scene, Progress.silent()).folder)
+        except BadInput as error:
+            problem = str(error)
+        except KeyboardInterrupt as stop:
+            problem = reason_of(stop)
+        except Exception as error:
+            problem = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else 'no message'}"
+    with suppress(OSError), connection:  # the one who asked may be gone
+        connection.send((folder, problem))
 
 
 @contextmanager

@@ -10,6 +10,7 @@ from importlib import import_module
 from ihbench import __version__, registry, streams
 from ihbench.errors import BadInput
 from ihbench.failures import Failure, explained, one_line
+from ihbench.interruption import interruptible
 
 COMMANDS = {
     "run": "fit a method under a protocol, score it, print the table (the main job)",
@@ -42,7 +43,8 @@ def usage() -> str:
         "",
         "start here: ihbench run --protocol zju_occ --scene standin-1",
         "exit status: 0 done, 1 a check failed or a run diverged, 2 bad input or a missing prerequisite,",
-        "             3 a fault of ihbench itself (IHBENCH_DEBUG=1 prints its traceback), 130 interrupted",
+        "             3 a fault of ihbench itself (IHBENCH_DEBUG=1 prints its traceback), 130 interrupted,",
+        "             128 and the number of another signal that ended it: 143 for SIGTERM, 129 for SIGHUP",
     ]
     return "\n".join(lines)
 
@@ -61,7 +63,8 @@ def main(argv: list[str] | None = None) -> int:
     argv = sys.argv[1:] if argv is None else argv
     streams.settle()
     try:
-        status = _run(argv)
+        with interruptible():
+            status = _run(argv)
         sys.stdout.flush()
         return status
     except SystemExit as end:  # --help, and what registered commands make of bad words

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from ihbench import registry, streams
 from ihbench.errors import BadInput, Diverged
+from ihbench.interruption import reason_of, status_of
 from ihbench.visible_text import visible
 
 DEBUG = "IHBENCH_DEBUG"  # environment variable: print tracebacks, too
@@ -34,7 +35,8 @@ def explained(error: BaseException) -> Failure | None:
         case Diverged():  # outside of a recorded run
             return Failure(1, "diverged", one_line(str(error)))
         case KeyboardInterrupt():
-            return Failure(130, "interrupted", "interrupted; the same command continues where it stopped")
+            how = reason_of(error).removesuffix(" by the user")
+            return Failure(status_of(error), "interrupted", f"{how}; the same command continues where it stopped")
         case OSError():
             return _system_error(error)
         case UnicodeError():

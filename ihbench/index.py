@@ -11,10 +11,10 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from ihbench import removal
+from ihbench import locks, removal
 from ihbench.errors import BadInput
 from ihbench.results import mean_rows
-from ihbench.store import RunFolder
+from ihbench.store import KILLED, LOCK, RunFolder
 
 UNREADABLE = "unreadable"
 LARGEST_FILE = 256 * 2**20  # bytes; no honest record comes near
@@ -53,8 +53,12 @@ class Index:
         Filters: protocol, scene, method, profile, seed, status ("unreadable" for damaged folders). Raises `BadInput`
         when there is no folder of runs, `ValueError` for an unknown filter.
         """
-        where, values = _conditions(filters)
-        return self._select(f"SELECT * FROM runs {where} ORDER BY created, id", values)
+        where, values = _conditions({name: value for name, value in filters.items() if name != "status"})
+        rows = self._select(f"SELECT * FROM runs {where} ORDER BY created, id", values)
+        for row in rows:
+            if row["status"] == "running" and not locks.is_held(self.runs / row["path"] / LOCK):
+                row |= {"status": "interrupted", "reason": KILLED}  # no file changes when a process dies
+        return [row for row in rows if filters.get("status", row["status"]) == row["status"]]
 
     def scores(self, **filters: Any) -> list[dict[str, Any]]:
         """Mean scores of the runs that match, one row for each run, predictor and identity string."""

@@ -11,6 +11,7 @@ from typing import Any
 
 from ihbench import atomic, machine, removal
 from ihbench.errors import BadInput, Diverged
+from ihbench.interruption import interruptible, reason_of, undisturbed
 from ihbench.ledger import Ledger, OnCheckpoint
 from ihbench.progress import Progress
 from ihbench.protocol import Protocol
@@ -52,20 +53,22 @@ class RecordedRun(ABC):
         except BadInput as outcome:
             self._end("failed", str(outcome))
             raise
-        except KeyboardInterrupt:
-            self._end("interrupted", "interrupted by the user")
+        except KeyboardInterrupt as stop:
+            self._end("interrupted", reason_of(stop))
             raise
-        except Exception as outcome:
+        except (Exception, SystemExit) as outcome:  # a method's own exit is a failure of the method
             reason = f"{type(outcome).__name__}: {str(outcome).splitlines()[0] if str(outcome) else 'no message'}"
-            atomic.write_text(self.folder.path / TRACEBACK, traceback.format_exc())
-            self._end("failed", f"{reason} (see {TRACEBACK})")
+            self._end("failed", f"{reason} (see {TRACEBACK})", traceback.format_exc())
 
-    def _end(self, status: str, reason: str) -> None:
-        self.describe()
-        try:
-            self.folder.set_status(status, reason, self.ledger)
-        except BadInput as error:  # the disk that failed the run may fail its record too; the first reason counts
-            self.progress.say(f"the run's record could not be written: {error}")
+    def _end(self, status: str, reason: str, details: str = "") -> None:
+        with undisturbed():
+            self.describe()
+            try:
+                if details:
+                    atomic.write_text(self.folder.path / TRACEBACK, details)
+                self.folder.set_status(status, reason, self.ledger)
+            except (BadInput, OSError) as error:  # the disk that failed the run may fail its record too
+                self.progress.say(f"the run's record could not be written: {error}")
 
     def describe(self, **more: Any) -> None:
         """Put the clocks, the peak memory, what the machine has turned out to be, and more into the record."""
@@ -86,19 +89,26 @@ def recorded(
     force: bool,
     make: Callable[[RunFolder], RecordedRun],
 ) -> RunResult:
-    """Find the finished run of this identity, or do it. See `RunFolder.create` for what `force` does."""
-    folder = RunFolder.create(runs, identity, about, force)
-    with folder.lock():
-        if not folder.finished:
-            gc.collect()  # what an earlier run in this process left in cycles is not this run's memory
-            machine.reset_peak_memory()
-            try:
-                make(folder).guarded()
-            except BaseException:
-                folder.settle(keep_new=False)
-                raise
-            folder.settle(keep_new=True)
-    return read_result(folder.path)
+    """Find the finished run of this identity, or do it. See `RunFolder.create` for what `force` does.
+
+    A finished one is found in places that may not be written, too.
+    """
+    with interruptible():
+        folder = RunFolder.create(runs, identity, about, force)
+        if folder.finished:
+            return read_result(folder.path)
+        with folder.lock():
+            if not folder.finished:  # a rival may have been quicker
+                gc.collect()  # what an earlier run in this process left in cycles is not this run's memory
+                machine.reset_peak_memory()
+                keep = False
+                try:
+                    make(folder).guarded()
+                    keep = True
+                finally:
+                    with undisturbed():
+                        folder.settle(keep)
+        return read_result(folder.path)
 
 
 def about_scene(capture: Capture, protocol: Protocol) -> dict[str, Any]:

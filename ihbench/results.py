@@ -109,7 +109,9 @@ def mean_rows(lines: Iterable[dict[str, Any]]) -> dict[str, dict[str, Mean]]:
 
 def read_result(folder: Path) -> RunResult:
     """Read a run folder. Raises `BadInput` when it is none or is damaged."""
-    record = RunFolder.open(folder).record
+    run = RunFolder.open(folder)
+    run.notice_death()
+    record = run.record
     if not record["identity"].keys() >= NAMED_BY or not record["about"].keys() >= {"standin", "variant"}:
         raise BadInput(f"{folder}: run.json is not a run record of this bench")
     lines: list[dict[str, Any]] = []

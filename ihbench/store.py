@@ -34,6 +34,7 @@ STATUSES = ("running", "done", "diverged", "failed", "interrupted", "skipped", "
 FINISHED = ("done", "diverged", "skipped")  # running such a run again would end the same way
 HASH_LENGTH = 10
 LOCK = "lock"
+KILLED = "its process ended without a word: it was killed, or the machine went down"
 # what the bench writes into a run folder: whatever else lies there is the user's, and stays
 WRITTEN = {
     "": {
@@ -194,6 +195,11 @@ class RunFolder:
     def _rows(self, name: str) -> list[Record]:
         file = self.path / name
         return atomic.read_json_lines(file) if file.is_file() else []
+
+    def notice_death(self) -> None:
+        """Of a run that says it is running, and that nobody is writing, know that it was interrupted."""
+        if self.status == "running" and not locks.is_held(self.path / LOCK):
+            self.record |= {"status": "interrupted", "reason": KILLED}
 
     # --- writing ---
 

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
-from ihbench import machine
+import os
+from types import SimpleNamespace
+
+import pytest
+
+from ihbench import atomic, machine
+from ihbench.errors import BadInput
 from ihbench.progress import Progress
-from ihbench.recorded_run import RecordedRun
+from ihbench.recorded_run import RecordedRun, recorded
 from ihbench.store import RunFolder
 from tests.bench.test_store import IDENTITY
 
@@ -39,3 +45,44 @@ def test_a_run_that_ends_well_says_so(tmp_path):
     record = RunFolder.open(folder.path).record
     assert record["status"] == "done"
     assert record["about"]["peak_mb"] > 10
+
+
+class Fails(RecordedRun):
+    def work(self):
+        raise SystemExit("this method prefers to leave")
+
+
+def test_a_method_that_exits_fails_and_takes_nothing_along(tmp_path):
+    folder = RunFolder.create(tmp_path, IDENTITY)
+    Fails(folder, Progress.silent()).guarded()
+    record = RunFolder.open(folder.path).record
+    assert record["status"] == "failed"
+    assert record["reason"] == "SystemExit: this method prefers to leave (see traceback.txt)"
+
+
+def test_a_record_that_cannot_be_written_is_said_and_the_first_reason_counts(tmp_path, monkeypatch):
+    folder = RunFolder.create(tmp_path, IDENTITY)
+    said = []
+    run = Fails(folder, SimpleNamespace(say=said.append))  # pyright: ignore
+
+    def broken(*_):
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr(atomic, "write_bytes", broken)
+    run.guarded()
+    assert said == ["the run's record could not be written: [Errno 5] Input/output error"]
+
+
+def test_a_finished_run_is_found_where_nothing_may_be_written(tmp_path, monkeypatch):
+    folder = RunFolder.create(tmp_path, IDENTITY, {"standin": "", "variant": ""})
+    folder.write_scores([{"row": "inpainthuman", "camera": "1", "frame": 0, "scores": {"a": 1.0}, "absent": {}}])
+    folder.set_status("done")
+
+    def read_only(*_, **__):
+        raise OSError(30, "Read-only file system")
+
+    for name in ("open", "replace", "mkdir", "rename", "unlink"):
+        monkeypatch.setattr(os, name, read_only)
+    assert recorded(tmp_path, IDENTITY, {}, False, lambda _: pytest.fail("run again")).status == "done"
+    with pytest.raises(BadInput, match="Read-only file system"):
+        recorded(tmp_path, IDENTITY, {}, True, lambda _: pytest.fail("run again"))

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ihbench import atomic, registry
 from ihbench.body import load_body
 from ihbench.errors import BadInput
+from ihbench.interruption import end_with_parent
 from ihbench.methods.inpainthuman.inpainting.part_map import part_labels
 from ihbench.methods.inpainthuman.inpainting.person_crop import PADDING, person_crop
 from ihbench.progress import Progress
@@ -83,7 +84,7 @@ class CropAlbum:
             return
         with progress.task("photographing people", len(missing) * PAGE) as task:
             work = [(self.people, s, self.each, self.size, self.path(s)) for s in missing]
-            with ProcessPoolExecutor(min(os.cpu_count() or 1, len(missing))) as pool:
+            with ProcessPoolExecutor(min(os.cpu_count() or 1, len(missing)), initializer=end_with_parent) as pool:
                 for _ in pool.map(_write_page, work):
                     task.advance(PAGE)
 

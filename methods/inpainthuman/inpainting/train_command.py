@@ -43,6 +43,7 @@ def main(argv: list[str]) -> int:
 
 def _train(chosen: Any) -> dict[str, Any]:
     from ihbench.data_source import cache_folder
+    from ihbench.locks import locked
     from ihbench.methods.inpainthuman.inpainting.mini_card import write_card
     from ihbench.methods.inpainthuman.inpainting.mini_folder import SHIPPED
     from ihbench.methods.inpainthuman.inpainting.mini_validation import validate
@@ -56,13 +57,14 @@ def _train(chosen: Any) -> dict[str, Any]:
     album = chosen.album or cache_folder() / "album"
     # a GPU waits for one process that draws occluders; on the CPU more processes would only take from each other
     workers = 0 if chosen.device == "cpu" else max((os.cpu_count() or 1) - 2, 0)
-    trainer = MiniTrainer(
-        chosen.train, chosen.out / TRAINING, album, Progress(), chosen.device, workers, start=chosen.start
-    )
-    backbone = trainer.run()
-    save_mini(backbone, chosen.out)
-    result = validate(backbone, album, chosen.train.each, Progress())
-    write_card(chosen.out, chosen.train, trainer.seconds, result, chosen.device, chosen.start)
+    with locked(chosen.out / TRAINING / "lock", "choose another --out folder"):
+        trainer = MiniTrainer(
+            chosen.train, chosen.out / TRAINING, album, Progress(), chosen.device, workers, start=chosen.start
+        )
+        backbone = trainer.run()
+        save_mini(backbone, chosen.out)
+        result = validate(backbone, album, chosen.train.each, Progress())
+        write_card(chosen.out, chosen.train, trainer.seconds, result, chosen.device, chosen.start)
     return result
 
 
