@@ -17,9 +17,11 @@ from ihbench.metrics.identity import Identity, Score
 from ihbench.metrics.images import (
     Color,
     Mask,
+    as_background,
     as_image,
     as_mask,
     bounds,
+    check_brightness,
     check_images,
     differing_pixels,
     grown,
@@ -143,6 +145,7 @@ def evaluate(
     slow: bool = True,
     over: Sequence[str] | None = None,
     withheld: Mapping[str, str] | None = None,
+    hdr: bool = False,
 ) -> dict[str, Score]:
     """Score one frame: identity string -> score, for every region and every metric of the preset.
 
@@ -152,13 +155,16 @@ def evaluate(
     says why, and which may still serve as a crop. A preset that has regions of its own (the
     released evaluators do) takes those, and a region it needs that is not given is a reason too.
     `background` is what the images were composited on and what is painted outside a region. `slow=False` leaves out
-    the metrics that take a network. Raises `ValueError` for shapes and dtypes that do not match and for images of
-    four channels, `BadInput` for an unknown preset.
+    the metrics that take a network; `hdr=True` takes floats of any range, which a preset may clip. Raises
+    `ValueError` for shapes that do not match, for what is no image (`images.as_image`; here one of the two may be
+    uint8, the other float) and for a background outside [0, 1], `BadInput` for an unknown preset.
     """
     chosen = preset if isinstance(preset, Preset) else find_preset(preset)
-    pred, truth = _color_image(pred, "pred"), _color_image(truth, "truth")
-    if pred.shape != truth.shape:
-        raise ValueError(f"images: expected two of the same shape, got pred {pred.shape}, truth {truth.shape}")
+    pred, truth = (_color_image(image, name, hdr) for image, name in ((pred, "pred"), (truth, "truth")))
+    check_images(pred, truth, mixed=True)
+    if not hdr and pred.dtype == truth.dtype:
+        check_brightness(pred, truth)
+    as_background(background, 3)
     given = {name: _checked_region(region, pred.shape) for name, region in (regions or {"full": None}).items()}
     given.setdefault("full", None)
     asked = tuple(over if over is not None else regions or ("full",))
@@ -206,16 +212,11 @@ def _known_outcomes(region: Mask | None, known: list[tuple[Mask | None, dict[int
     return known[-1][1]
 
 
-def _color_image(image: Any, name: str) -> NDArray:
+def _color_image(image: Any, name: str, hdr: bool) -> NDArray:
     """[H, W, 3]; grey images get three equal channels."""
-    image = as_image(image, name)
-    if image.ndim == 3 and image.shape[2] == 1:
-        image = image[..., 0]
-    if image.ndim == 2:
-        return np.repeat(image[..., None], 3, axis=2)
-    if image.ndim != 3 or image.shape[2] != 3:
-        hint = "; composite RGBA on the background first" if image.ndim == 3 and image.shape[2] == 4 else ""
-        raise ValueError(f"{name}: expected an image [H, W, 3] or [H, W], got {image.shape}{hint}")
+    image = as_image(image, name, hdr=hdr)
+    if image.ndim == 2 or image.shape[2] == 1:
+        return np.repeat(image.reshape(*image.shape[:2], 1), 3, axis=2)
     return image
 
 
@@ -223,10 +224,7 @@ def _checked_region(region: Any, shape: tuple[int, ...]) -> Region:
     """The region as a mask with both states, None for a mask of everything, a reason for one of nothing."""
     if region is None or isinstance(region, str):
         return region
-    mask = as_mask(region)
-    if not isinstance(mask, np.ndarray) or mask.shape != shape[:2] or mask.dtype != np.bool_:
-        got = f"{mask.dtype} {mask.shape}" if isinstance(mask, np.ndarray) else type(mask).__name__
-        raise ValueError(f"mask: expected bool {shape[:2]} like the images, got {got}")
+    mask = as_mask(region, shape)
     covered = int(np.count_nonzero(mask))
     return "empty region in this view" if covered == 0 else None if covered == mask.size else mask
 

@@ -35,7 +35,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench.metrics.images import Mask, bounds, checked, differing_pixels, grown, peak_of
+from ihbench.metrics.images import Mask, as_background, bounds, checked, differing_pixels, grown, peak_of
 
 PPD = (
     0.7 * (3840 / 0.7) * math.pi / 180
@@ -67,6 +67,7 @@ def flip(
     *,
     ppd: float = PPD,
     background: float | tuple[float, ...] = 1.0,
+    hdr: bool = False,
 ) -> float:
     """Mean FLIP over the frame, or over a region: in [0, 1], 0 for identical images.
 
@@ -74,11 +75,12 @@ def flip(
     background: for a region both images are first painted with it outside the mask, a value or one per channel in
         [0, 1]; then the map is averaged over the mask, so nothing outside can leak in through the filters
 
-    Values outside [0, 1] are clipped. An empty mask gives NaN, a NaN or infinite pixel inside the mask NaN. Raises
-    `ValueError` for shapes or dtypes that do not match, for images that do not have three channels, and for a `ppd`
-    below 1.
+    Values outside [0, 1] are clipped; far outside they are refused, unless `hdr=True` says that they are meant. An
+    empty mask gives NaN, a NaN or infinite pixel inside the mask NaN. Raises `ValueError` for shapes or dtypes that
+    do not match, for what is no image (`images.as_image`), for a background outside [0, 1], and for a `ppd` below 1.
     """
-    pred, truth, mask = _checked_colors(pred, truth, mask)
+    pred, truth, mask = _checked_colors(pred, truth, mask, hdr)
+    as_background(background, 3)
     return mean_flip(pred, truth, differing_pixels(pred, truth), mask, background, ppd)
 
 
@@ -109,9 +111,10 @@ def flip_map(
     truth: Any,  # as pred
     *,
     ppd: float = PPD,
+    hdr: bool = False,
 ) -> NDArray[np.float64]:
     """[H, W] FLIP at every pixel; NaN where a filter meets a NaN or infinite pixel. Raises `ValueError` as `flip`."""
-    pred, truth, _ = _checked_colors(pred, truth, None)
+    pred, truth, _ = _checked_colors(pred, truth, None, hdr)
     filters = Filters.of(ppd)
     differs = differing_pixels(pred, truth)
     values = np.zeros(differs.shape)
@@ -193,13 +196,13 @@ def _hunt_lab(xyz: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array([lightness, 5 * lightness * (x - y), 2 * lightness * (y - z)])
 
 
-def _checked_colors(pred: Any, truth: Any, mask: Any) -> tuple[NDArray, NDArray, Mask | None]:
-    """Two images [H, W, 3] and a mask that can be compared. Raises `ValueError` otherwise."""
-    pred, truth, mask = checked(pred, truth, mask)
-    if pred.ndim == 2:
-        pred, truth = (np.broadcast_to(image[..., None], (*image.shape, 3)) for image in (pred, truth))
-    if pred.shape[2] != 3:
-        raise ValueError(f"flip: expected images [H, W, 3] or [H, W], got {pred.shape}")
+def _checked_colors(pred: Any, truth: Any, mask: Any, hdr: bool) -> tuple[NDArray, NDArray, Mask | None]:
+    """Two images [H, W, 3] and a mask that can be compared; grey becomes three channels. Raises `ValueError`."""
+    pred, truth, mask = checked(pred, truth, mask, hdr=hdr)
+    if pred.ndim == 2 or pred.shape[2] == 1:
+        pred, truth = (
+            np.broadcast_to(image.reshape(*image.shape[:2], 1), (*image.shape[:2], 3)) for image in (pred, truth)
+        )
     return pred, truth, mask
 
 

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.errors import BadInput
-from ihbench.metrics.images import as_mask, bounds, checked, peak_of
+from ihbench.metrics.images import as_background, as_mask, bounds, checked, peak_of
 from ihbench.weights import FILES, locate
 
 NETS = ("vgg", "alex", "squeeze")
@@ -46,23 +46,26 @@ def lpips(
     feed: str = "[-1,1]",
     background: float | tuple[float, ...] = 1.0,
     crop: Any = None,  # [H, W] bool
+    hdr: bool = False,
 ) -> float:
     """LPIPS over the frame, or over a region; 0 for identical images.
 
     For a region both images are painted with `background` outside the mask and cut to the bounding rectangle of
     `crop` (of the mask, where none is given): nothing outside can leak in. What is smaller than `MIN_SIDE` is padded
-    with grey. An empty mask gives NaN, a NaN or infinite pixel inside the region NaN. Raises `ValueError` for images
-    that do not match and for an unknown net or feed, `BadInput` when the trunk's weights are not here.
+    with grey. An empty mask gives NaN, a NaN or infinite pixel inside the region NaN. `hdr=True` takes floats of any
+    range as they are. Raises `ValueError` for images that do not match or are none (`images.as_image`), for a
+    background outside [0, 1] and for an unknown net or feed, `BadInput` when the trunk's weights are not here.
     """
     if net not in NETS or feed not in FEEDS:
         raise ValueError(f"lpips: expected net in {NETS} and feed in {FEEDS}, got {net!r}, {feed!r}")
-    pred, truth, mask = checked(pred, truth, mask)
+    pred, truth, mask = checked(pred, truth, mask, hdr=hdr)
+    paint = as_background(background, 3).astype(np.float32)
+    cut = None if crop is None else as_mask(crop, pred.shape, "crop")
     network = load(net)
     if isinstance(network, str):
         raise BadInput(network)
     rectangle = (slice(None), slice(None))
     if mask is not None:
-        cut = as_mask(crop)
         found = bounds(mask if cut is None else cut)
         if found is None or not mask.any():
             return math.nan
@@ -70,7 +73,7 @@ def lpips(
     x, y = (_colors(image[rectangle]) for image in (pred, truth))
     if mask is not None:
         inside = mask[rectangle][..., None]
-        x, y = (np.where(inside, image, np.asarray(background, np.float32)) for image in (x, y))
+        x, y = (np.where(inside, image, paint) for image in (x, y))
     if x.size == 0 or not (np.isfinite(x).all() and np.isfinite(y).all()):
         return math.nan
     return 0.0 if np.array_equal(x, y) else network.distance(padded(x), padded(y), feed)
@@ -224,11 +227,7 @@ def random_networks(seed: int = 0) -> Iterator[dict[str, Network]]:
 
 
 def _colors(image: NDArray) -> NDArray[np.float32]:
-    """[H, W, 3] float32 with peak 1; grey images get three equal channels. Raises `ValueError` for other counts."""
-    if image.ndim == 2:
-        image = image[..., None]
-    if image.shape[2] == 1:
-        image = np.repeat(image, 3, axis=2)
-    if image.shape[2] != 3:
-        raise ValueError(f"lpips: expected images [H, W, 3] or [H, W], got {image.shape}")
+    """[H, W, 3] float32 with peak 1; grey images get three equal channels."""
+    if image.ndim == 2 or image.shape[2] == 1:
+        image = np.repeat(image.reshape(*image.shape[:2], 1), 3, axis=2)
     return (image / np.float32(peak_of(image.dtype))).astype(np.float32)

@@ -190,7 +190,7 @@ def _network(
     from ihbench.metrics.lpips import lpips
 
     try:
-        return lpips(pred, truth, mask, net=net, feed=feed, background=background, crop=crop)
+        return lpips(pred, truth, mask, net=net, feed=feed, background=background, crop=crop, hdr=True)  # checked
     except BadInput as error:
         return str(error)
 

@@ -18,23 +18,26 @@ def psnr(
     pred: Any,  # [H, W, C] or [H, W], float in [0, 1] or uint8
     truth: Any,  # as pred
     mask: Any = None,  # [H, W] bool; None is the whole frame
+    *,
+    hdr: bool = False,  # take floats of any range as they are
 ) -> float:
     """PSNR in dB for a peak of 1 (255 for uint8): -10 log10 of the mean squared error over the mask and all channels.
 
     Averaging the three channels' PSNRs instead, as some released code does, is never smaller (Jensen) and is a
     different number: `mean_of_channels`. Identical images give inf, an empty mask NaN, a NaN or infinite pixel inside
-    the mask NaN. Pixels outside the mask never count. Raises `ValueError` when shapes or dtypes do not match.
+    the mask NaN. Pixels outside the mask never count. Raises `ValueError` when shapes or dtypes do not match, and for
+    what is no image in this sense (`images.as_image`).
     """
-    pred, truth, mask = checked(pred, truth, mask)
+    pred, truth, mask = checked(pred, truth, mask, hdr=hdr)
     return SquaredError.of(pred, truth, differing_pixels(pred, truth)).pooled(mask)
 
 
-def mean_of_channels(pred: Any, truth: Any, mask: Any = None) -> float:
+def mean_of_channels(pred: Any, truth: Any, mask: Any = None, *, hdr: bool = False) -> float:
     """The mean of the channels' own PSNRs, the habit of code descended from 3D Gaussian splatting.
 
     One channel without any error makes it inf. Otherwise as `psnr`.
     """
-    pred, truth, mask = checked(pred, truth, mask)
+    pred, truth, mask = checked(pred, truth, mask, hdr=hdr)
     return SquaredError.of(pred, truth, differing_pixels(pred, truth)).mean_of_channels(mask)
 
 

@@ -26,17 +26,19 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench.metrics.images import Mask, bounds, checked, differing_pixels, grown, peak_of
+from ihbench.metrics.images import Mask, as_background, bounds, checked, differing_pixels, grown, peak_of
 
 K1, K2 = 0.01, 0.03
 BAND = 2**16  # about so many pixels are worked on at a time: their float64 sums and differences take 1.5 MB
 
 Border = Literal["mirror", "reflect", "zero"]
+BORDERS = ("mirror", "reflect", "zero")
 
 
 @dataclass(frozen=True)
 class Window:
-    """Everything that defines an SSIM. Raises `ValueError` for a window without a centre or a width."""
+    """Everything that defines an SSIM. Raises `ValueError` for a window without a centre or a width, for a data range
+    that is not above 0 and for an unknown border."""
 
     size: int = 11  # px, odd
     sigma: float | None = 1.5  # px; None for equal weights
@@ -46,9 +48,17 @@ class Window:
     sample: bool = False  # moments times n/(n-1), scikit-image's default
 
     def __post_init__(self) -> None:
+        for name, value in (("window", self.size), ("crop", self.crop)):
+            if isinstance(value, bool) or not isinstance(value, int | np.integer):
+                raise ValueError(f"ssim {name}: expected a whole number of pixels, got {value!r}")
         if self.size < 1 or self.size % 2 == 0 or (self.sigma is not None and not self.sigma > 0):
             raise ValueError(
                 f"ssim window: expected an odd size and sigma > 0, got window={self.size}, sigma={self.sigma}"
+            )
+        if not 0 < self.data_range < math.inf or self.border not in BORDERS:
+            raise ValueError(
+                f"ssim: expected a data range above 0 and a border of {', '.join(BORDERS)}, "
+                f"got {self.data_range!r}, {self.border!r}"
             )
         if self.crop < 0 or (self.sample and self.size == 1):
             raise ValueError(f"ssim window: crop below 0 or sample moments of one pixel: {self}")
@@ -79,6 +89,7 @@ def ssim(
     crop: int = 0,
     sample: bool = False,
     background: float | tuple[float, ...] | None = 1.0,
+    hdr: bool = False,
 ) -> float:
     """Mean SSIM over the frame, or over a region.
 
@@ -86,11 +97,14 @@ def ssim(
     `data_range`) outside the mask, then the map is averaged over the mask: nothing outside can leak in through the
     windows. `background=None` does not paint, as OccNeRF's evaluator does not; then windows at the mask's border see
     what lies outside. The other switches are the fields of `Window`. uint8 images are divided by 255. An empty mask
-    gives NaN, a NaN or infinite pixel inside the mask NaN, a frame without pixels beyond `crop` NaN. Raises
-    `ValueError` for shapes or dtypes that do not match and for an even window.
+    gives NaN, a NaN or infinite pixel inside the mask NaN, a frame without pixels beyond `crop` NaN. `hdr=True` takes
+    floats of any range as they are. Raises `ValueError` for shapes or dtypes that do not match, for what is no image
+    (`images.as_image`), for a background outside the range and for an even window.
     """
-    pred, truth, mask = checked(pred, truth, mask)
     definition = Window(window, sigma, data_range, border, crop, sample)
+    pred, truth, mask = checked(pred, truth, mask, hdr=hdr, data_range=data_range)
+    if background is not None:
+        as_background(background, pred.shape[2] if pred.ndim == 3 else 1, data_range)
     return mean_ssim(pred, truth, differing_pixels(pred, truth), mask, definition, background)
 
 
@@ -120,9 +134,10 @@ def ssim_map(
     truth: Any,  # as pred
     *,
     window: Window = HEADLINE,
+    hdr: bool = False,
 ) -> NDArray[np.float64]:
     """SSIM at every pixel and channel, with the images' shape. Raises `ValueError` as `ssim` does."""
-    pred, truth, _ = checked(pred, truth)
+    pred, truth, _ = checked(pred, truth, hdr=hdr, data_range=window.data_range)
     out = np.ones(pred.shape)
     for band in _bands(differing_pixels(pred, truth), None, window.size // 2):
         _deficit_of(pred, truth, band, None, None, window, None, out)

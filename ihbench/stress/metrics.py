@@ -91,7 +91,7 @@ def _against_oracle(metric: str, x: NDArray, y: NDArray, mask: NDArray[np.bool_]
     condition = None
     if np.isfinite(x).all() and (x != y).any():
         condition = {"psnr": condition_of_psnr, "ssim": condition_of_ssim}.get(metric, lambda x, y: None)(x, y)
-    return Answer(METRICS[metric](x, y, mask), ORACLES[metric](x, y, mask), condition)
+    return Answer(METRICS[metric](x, y, mask, hdr=True), ORACLES[metric](x, y, mask), condition)
 
 
 def _one_lsb_oracle(metric: str) -> Answer:
@@ -161,17 +161,17 @@ def _hdr() -> Answer:
 def _half_overflow() -> Answer:
     """60000² is beyond float16."""
     x, y = flat(6e4, dtype=np.float16), flat(0, dtype=np.float16)
-    return Answer(psnr(x, y), -20 * math.log10(float(np.float16(6e4))))
+    return Answer(psnr(x, y, hdr=True), -20 * math.log10(float(np.float16(6e4))))
 
 
 def _double_overflow() -> Answer:
     """(1e200)² is beyond float64."""
-    return Answer(psnr(flat(1e200), flat(0)), -4000.0)
+    return Answer(psnr(flat(1e200), flat(0), hdr=True), -4000.0)
 
 
 def _below_double() -> Answer:
     """(1e-170)² is below float64: an error that is there must not become none."""
-    return Answer(psnr(flat(1e-170), flat(0)), 3400.0)
+    return Answer(psnr(flat(1e-170), flat(0), hdr=True), 3400.0)
 
 
 def _tiny_on_large(amplitude: float) -> tuple[NDArray, NDArray]:

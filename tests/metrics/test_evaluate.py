@@ -51,8 +51,8 @@ def test_values_are_clipped_and_rounded_to_8_bits():
     assert evaluate(unrounded, to_8bit(TRUTH))["psnr/pooled/range1/full/v1"].value == math.inf
     assert close.keys() == evaluate(PRED, TRUTH).keys()
     white = np.ones((9, 9, 3))
-    assert evaluate(white * 7.5, white)["psnr/pooled/range1/full/v1"].value == math.inf
-    assert evaluate(white * -3, white * 0)["psnr/pooled/range1/full/v1"].value == math.inf
+    assert evaluate(white * 7.5, white, hdr=True)["psnr/pooled/range1/full/v1"].value == math.inf
+    assert evaluate(white * -3, white * 0, hdr=True)["psnr/pooled/range1/full/v1"].value == math.inf
 
 
 def test_a_mask_of_everything_is_the_whole_frame():

@@ -50,9 +50,11 @@ def texture(height, width, seed=0):
     return np.random.default_rng(seed).integers(0, 256, (height, width, 3)) / 255
 
 
-def all_of(pred, truth, mask=None, but=()):
+def all_of(pred, truth, mask=None, but=(), hdr=False):
     """Every metric's value; LPIPS has the frame as its crop."""
-    found = {name: metric(pred, truth, mask) for name, metric in METRICS.items() if name not in (*but, "lpips")}
+    found = {
+        name: metric(pred, truth, mask, hdr=hdr) for name, metric in METRICS.items() if name not in (*but, "lpips")
+    }
     if "lpips" not in but:
         found["lpips"] = lpips(pred, truth)
     return found
@@ -127,12 +129,17 @@ def test_a_pixel_that_is_not_finite_is_nan_where_it_counts(bad, dtype):
 def test_hdr_counts_as_it_is_and_is_clipped_where_a_display_is_meant(dtype):
     x, y = as_type(texture(24, 24) * 100, dtype), as_type(texture(24, 24, 1), dtype)
     error = np.square(as_float64(x) - as_float64(y)).mean()
-    found = all_of(x, y, but=["lpips"])
+    found = all_of(x, y, but=["lpips"], hdr=True)
     assert found["psnr"] == pytest.approx(-10 * math.log10(error), rel=1e-12)
     assert -1 <= found["ssim"] <= 1
     assert found["flip"] == pytest.approx(flip(x.clip(0, 1), y), abs=1e-12)
     largest = as_type(np.full((12, 12, 3), 6e4), dtype)  # its square is beyond float16
-    assert math.isfinite(psnr(largest, as_type(np.zeros((12, 12, 3)), dtype)))
+    assert math.isfinite(psnr(largest, as_type(np.zeros((12, 12, 3)), dtype), hdr=True))
+    for name in registry.names("metric preset"):
+        assert evaluate(x, y, preset=name, hdr=True)
+    for metric in (*METRICS.values(), evaluate):
+        with pytest.raises(ValueError, match="hdr=True"):
+            metric(x, y)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)

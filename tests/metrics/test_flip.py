@@ -292,8 +292,8 @@ def test_values_outside_the_range_are_clipped():
     pred, truth = pair((20, 24))
     pred[3:9], truth[5:12] = 7.5, -2.0
     expected = flip_map(np.clip(pred, 0, 1), np.clip(truth, 0, 1))
-    np.testing.assert_array_equal(flip_map(pred, truth), expected)
-    assert flip(np.full((9, 9, 3), 1.0), np.full((9, 9, 3), 1e30)) == 0.0
+    np.testing.assert_array_equal(flip_map(pred, truth, hdr=True), expected)
+    assert flip(np.full((9, 9, 3), 1.0), np.full((9, 9, 3), 1e30), hdr=True) == 0.0
 
 
 @given(st.integers(0, 10_000), st.floats(0, 1))
