@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ihbench.errors import BadValue
 
 Array = NDArray[np.float64]
 
@@ -26,26 +29,62 @@ class Camera:
     distortion: Array | None = field(default=None)  # [5] OpenCV k1 k2 p1 p2 k3, or None
 
     def __post_init__(self) -> None:
+        """Raises `ValueError` for what is no camera: see `check_intrinsics` and `check_rotation`."""
         for name, shape in (("K", (3, 3)), ("R", (3, 3)), ("t", (3,)), ("distortion", (5,))):
             value = getattr(self, name)
             if value is None and name == "distortion":
                 continue
-            value = np.array(value, dtype=np.float64)
-            if value.shape != shape or not np.isfinite(value).all():
-                raise ValueError(f"camera {name}: expected finite values of shape {shape}, got shape {value.shape}")
+            value = as_numbers(value, f"camera {name}")
+            if value.shape != shape:
+                word = "; Camera.from_opencv takes columns, rotation vectors and other distortions"
+                raise BadValue(
+                    f"camera {name}: expected finite values of shape {shape}, got shape {value.shape}{word}"
+                )
             value.setflags(write=False)
             object.__setattr__(self, name, value)
-        if self.width < 1 or self.height < 1:
-            raise ValueError(f"camera size: expected at least 1×1 px, got {self.width}×{self.height}")
+        check_intrinsics(self.K)
+        check_rotation(self.R)
+        for name in ("width", "height"):
+            size = getattr(self, name)
+            if isinstance(size, bool) or not isinstance(size, int | np.integer) or size < 1:
+                raise BadValue(
+                    f"camera size: expected whole numbers of pixels, at least 1×1, got {self.width!r}×{self.height!r}"
+                )
+            object.__setattr__(self, name, int(size))
 
     @classmethod
     def from_opencv(
-        cls, K: Array, R: Array, t: Array, width: int, height: int, distortion: Array | None = None
+        cls,
+        K: Any,  # [3, 3] px
+        R: Any,  # [3, 3], or a rotation vector of three numbers, rad
+        t: Any,  # three numbers, m
+        width: int,
+        height: int,
+        distortion: Any = None,  # 4, 5, 8, 12 or 14 numbers in OpenCV's order
     ) -> Camera:
-        """A camera from an OpenCV calibration, whose pixel centres are integers; t in metres."""
-        K = np.array(K, dtype=np.float64)
+        """A camera from an OpenCV calibration, whose pixel centres are integers.
+
+        Lists, tensors, rows and columns are taken, as OpenCV and its YAML files have them. Only k1 k2 p1 p2 k3 can be
+        kept: others must be 0. A distortion of zeros is none. Raises `ValueError`.
+        """
+        from ihbench.body.skinning_numpy import axis_angle_to_matrix  # the body imports cameras
+
+        K = as_numbers(K, "camera K")
+        K = K[0] if K.shape == (1, 3, 3) else K
+        if K.shape != (3, 3):
+            word = "; give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]" if K.size == 4 else ""
+            raise BadValue(f"camera K: expected shape [3, 3], got {list(K.shape)}{word}")
         K[:2, 2] += 0.5
-        return cls(K, R, t, width, height, distortion)
+        R = as_numbers(R, "camera R")
+        if R.size == 3:
+            R = axis_angle_to_matrix(R.reshape(3))
+        elif R.shape == (1, 3, 3):
+            R = R[0]
+        t = as_numbers(t, "camera t")
+        if t.size != 3:
+            word = "; its last column is t, the rest R" if t.shape[-2:] in ((3, 4), (4, 4)) else ""
+            raise BadValue(f"camera t: expected three numbers, got shape {list(t.shape)}{word}")
+        return cls(K, R, t.reshape(3), width, height, five_coefficients(distortion))
 
     @property
     def K_opencv(self) -> Array:
@@ -95,6 +134,54 @@ class Camera:
         K[0, 2] -= x0
         K[1, 2] -= y0
         return replace(self, K=K, width=width, height=height)
+
+
+def as_numbers(value: Any, what: str) -> Array:
+    """A float64 copy of a list, an array or a tensor. Raises `ValueError` unless all are finite numbers."""
+    if hasattr(value, "detach"):  # a torch tensor; torch itself is not imported for this
+        value = value.detach().cpu().double().numpy()
+    try:
+        array = np.array(value)
+        array = array.astype(np.float64, casting="same_kind" if array.dtype.kind != "b" else "no")
+    except (TypeError, ValueError):
+        raise BadValue(f"{what}: expected numbers, got a {type(value).__name__} of other contents") from None
+    if not np.isfinite(array).all():
+        raise BadValue(f"{what}: expected finite values, got NaN or infinity in shape {list(array.shape)}")
+    return array
+
+
+def five_coefficients(distortion: Any) -> Array | None:
+    """[5] k1 k2 p1 p2 k3 of any OpenCV distortion; None for none. Raises `ValueError` for what they cannot say."""
+    if distortion is None:
+        return None
+    values = as_numbers(distortion, "camera distortion").reshape(-1)
+    if values.size not in (0, 4, 5, 8, 12, 14):
+        raise BadValue(
+            f"camera distortion: expected 4, 5, 8, 12 or 14 numbers (k1 k2 p1 p2 k3 …), got {values.size}; "
+            f"a fisheye or another model is no OpenCV distortion: undistort images and masks, and give none"
+        )
+    if values[5:].any():
+        raise BadValue(
+            f"camera distortion: expected k1 k2 p1 p2 k3 alone, got other terms that are not 0 "
+            f"({', '.join(f'{v:.4g}' for v in values[5:])}: rational, thin prism, tilt); undistort images and masks "
+            f"with cv2.undistort, and give none"
+        )
+    return np.pad(values[:5], (0, max(0, 5 - values.size))) if values.any() else None
+
+
+def check_intrinsics(K: Array, what: str = "camera K") -> None:
+    """Raise `ValueError` unless [3, 3] is [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0."""
+    if K[0, 0] <= 0 or K[1, 1] <= 0 or K[1, 0] != 0 or not np.array_equal(K[2], (0, 0, 1)):
+        word = "it looks transposed" if np.array_equal(K[:, 2], (0, 0, 1)) and K[2, :2].any() else "check the signs"
+        raise BadValue(f"{what}: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0; {word}")
+
+
+def check_rotation(R: Array, what: str = "camera R", tolerance: float = 1e-2) -> None:
+    """Raise `ValueError` unless [..., 3, 3] are rotations; calibrations written with two decimals still are."""
+    if (np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)) > tolerance).any():
+        raise BadValue(f"{what}: expected rotations (R Rᵀ = 1), got another matrix; leave scale and t out")
+    if (np.linalg.det(R) < 0).any():
+        raise BadValue(f"{what}: expected rotations, got a reflection (a left-handed world); flip one axis")
 
 
 def distort(x: Array, y: Array, coefficients: Array) -> tuple[Array, Array]:

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.files.pictures import encoded
+from ihbench.metrics.eight_bit import as_float
+from ihbench.metrics.images import as_image, check_images
 
 COLUMNS = ("training input", "truth", "prediction", "error x4")
 PAD, LABEL = 6, 18  # px
@@ -23,6 +25,18 @@ class SheetRow:
     truth: NDArray[np.float32]  # [H, W, 3] in [0, 1]
     prediction: NDArray[np.float32]  # [H, W, 3] in [0, 1]
     hidden: NDArray[np.bool_] | None = None  # [H, W] where the truth is not known: drawn grey, no error
+
+    def __post_init__(self) -> None:
+        """Raises `ValueError` for other layouts; uint8 becomes float, and what is out of range is clipped later."""
+        for name in ("truth", "prediction"):
+            object.__setattr__(
+                self, name, as_float(as_image(getattr(self, name), name, hdr=True)).astype(np.float32, copy=False)
+            )
+        check_images(self.prediction, self.truth)
+        if self.training.dtype != np.uint8 or self.training.shape[2:] != (3,):
+            raise ValueError(
+                f"training: expected uint8 [H, W, 3], got {self.training.dtype} {list(self.training.shape)}"
+            )
 
 
 def error_image(prediction: NDArray[np.float32], truth: NDArray[np.float32]) -> NDArray[np.uint8]:

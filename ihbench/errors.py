@@ -16,6 +16,10 @@ class BadInput(Exception):
         return visible(super().__str__())
 
 
+class BadValue(BadInput, ValueError):
+    """An argument of a Python call is wrong. Many of them were read from a file, and then it is bad input as well."""
+
+
 class Diverged(Exception):
     """A fit stopped because its loss or its parameters stopped being finite. A recorded outcome, not a crash.
 

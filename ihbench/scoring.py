@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from ihbench.machine import usable_cores
 from ihbench.metrics.eight_bit import rounded
 from ihbench.metrics.evaluate import Preset, evaluate, find_preset
 from ihbench.metrics.identity import Score
+from ihbench.metrics.images import as_image, check_range
 from ihbench.occlusion import withheld
 from ihbench.regions import SurfaceMap
 from ihbench.scene import TestView
@@ -31,6 +32,9 @@ if TYPE_CHECKING:
 VISIBILITY_TEXELS = 256  # side of the UV grid on which "seen in training" is decided
 AHEAD = 3  # test views read in the background while one is predicted
 MOST_WORKERS = 8  # threads; each holds a view
+# A renderer without a last clamp leaves [0, 1] in places; presets clip that or take it as it is. Beyond this a whole
+# run's pictures are of another range, and clipping them would make a score of nothing.
+RENDER_BELOW, RENDER_ABOVE = 0.5, 1.0
 
 
 @dataclass(frozen=True)
@@ -106,16 +110,14 @@ class Scorer:
 
     def score(self, loaded: LoadedView, image: NDArray | None, slow: bool = True) -> ViewScores:
         """Score one image; pixels whose truth nobody knows count as right, also where windows reach them. Raises
-        `BadInput` when it has another size than the test view."""
+        `BadInput` when it has another size, layout or range than the test view."""
         protocol = self.scene.protocol
         background = protocol.image.background
         scores: dict[str, Score] = {}
-        if image is not None and image.shape != loaded.view.image.shape:
-            raise BadInput(
-                f"prediction of {loaded.key.name}: has shape {image.shape}, expected {loaded.view.image.shape}"
-            )
-        if image is not None and loaded.view.hidden is not None:
-            image = _with_truth(image, loaded.view)
+        if image is not None:
+            image = as_prediction(image, loaded)
+            if loaded.view.hidden is not None:
+                image = _with_truth(image, loaded.view)
         for preset in self.presets:
             if image is None:
                 scores |= preset.absent(protocol.regions, background, "no prediction of this view")
@@ -129,6 +131,7 @@ class Scorer:
                     slow,
                     protocol.regions,
                     self.withheld,
+                    hdr=True,  # `as_prediction` has looked at the range
                 )
         return ViewScores(loaded.key, scores)
 
@@ -152,6 +155,7 @@ class Scorer:
         def finish(loaded: LoadedView, images: dict[str, NDArray | None] | None) -> ScoredView:
             if images is None:
                 images = {name: predict(loaded) for name, predict in rows.items()}
+            images = {name: None if image is None else as_prediction(image, loaded) for name, image in images.items()}
             scores = {name: self.score(loaded, image, slow) for name, image in images.items()}
             if after_each is not None:
                 after_each(loaded, images)
@@ -189,3 +193,16 @@ def _with_truth(image: NDArray, view: TestView) -> NDArray:
     whoever left them out are told the same."""
     paint = rounded(view.image) if image.dtype == np.uint8 else view.image.astype(image.dtype)
     return np.where(view.hidden[..., None], paint, image)
+
+
+def as_prediction(image: Any, loaded: LoadedView) -> NDArray:
+    """What a predictor gave for a test view, as an array [H, W, 3], uint8 or float with peak 1. Raises `BadInput`."""
+    expected = loaded.view.image.shape
+    try:
+        array = as_image(image, "image", hdr=True)
+        check_range(array, "image", below=RENDER_BELOW, above=RENDER_ABOVE, otherwise="")
+    except ValueError as error:
+        raise BadInput(f"prediction of {loaded.key.name}: {error}") from error
+    if array.shape != expected:
+        raise BadInput(f"prediction of {loaded.key.name}: has shape {array.shape}, expected {expected}")
+    return array

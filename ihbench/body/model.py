@@ -99,6 +99,8 @@ class Body:
         if blend_shapes and self.posedirs is not None:
             vertices = vertices + skinning_numpy.pose_blend_offsets(body_pose.pose, self.posedirs)
         if offsets is not None:
+            if np.shape(offsets) != vertices.shape:
+                raise ValueError(f"offsets: expected {vertices.shape} like the vertices, got {np.shape(offsets)}")
             vertices = vertices + offsets
         transforms = skinning_numpy.joint_transforms(body_pose.pose, joints, self.parents, body_pose.transl)
         return skinning_numpy.lbs(vertices, self.weights, transforms)

@@ -49,7 +49,9 @@ class Texels:
 
 @lru_cache(maxsize=32)
 def texel_table(body: Body, resolution: int) -> Texels:
-    """The texels of a body's texture map; cached for each body object and resolution."""
+    """The texels of a body's texture map; cached for each body object and resolution. Raises `ValueError`."""
+    if isinstance(resolution, bool) or not isinstance(resolution, int | np.integer) or resolution < 1:
+        raise ValueError(f"texture: expected a whole number of texels a side, got {resolution!r}")
     corners = map_coordinates(body.uv, resolution) + 0.5
     flat = np.column_stack([corners, np.ones(len(corners))])
     raster = rasterize(flat, body.uv_faces, resolution, resolution)
@@ -97,8 +99,13 @@ def sample_uv(
     values: NDArray,  # [R, R, C]
     uv: Array,  # [N, 2]
 ) -> NDArray[np.float64]:
-    """[N, C] bilinear samples of a map; outside the outermost texel centres the edge value holds."""
+    """[N, C] bilinear samples of a map; outside the outermost texel centres the edge value holds. Raises `ValueError`
+    for a map that is not square with channels last, and for uv that are not pairs."""
     resolution = values.shape[0]
+    if values.ndim != 3 or values.shape[1] != resolution or np.ndim(uv) != 2 or np.shape(uv)[1] != 2:
+        raise ValueError(
+            f"texture: expected a map [R, R, C], channels last, and uv [N, 2], got {values.shape}, {np.shape(uv)}"
+        )
     position = np.clip(map_coordinates(np.asarray(uv, np.float64), resolution), 0, resolution - 1)
     low = np.minimum(position.astype(np.int64), max(resolution - 2, 0))
     high = np.minimum(low + 1, resolution - 1)
@@ -114,6 +121,10 @@ def position_map(
     resolution: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Where each texel of the surface is: [R, R, 3] m, 0 off the charts, and the mask [R, R] of texels on them."""
+    if np.shape(vertices) != body.v_template.shape:
+        raise ValueError(
+            f"position map: expected vertices {body.v_template.shape} of this body, got {np.shape(vertices)}"
+        )
     texels = texel_table(body, resolution)
     out = np.zeros((resolution**2, 3), np.float32)
     out[texels.index] = texels.interpolate(vertices, body.faces)

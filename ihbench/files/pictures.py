@@ -181,8 +181,14 @@ def read_picture(path: Path, name: str = "", colours_matter: bool = True) -> Pic
 
 
 def encoded(picture: NDArray[np.uint8], kind: str, **options: int) -> bytes:
-    """The file of a picture, in memory."""
+    """The file of a picture [H, W] or [H, W, 3], in memory. Raises `ValueError` for anything else."""
     from PIL import Image
+
+    if picture.dtype != np.uint8 or picture.ndim not in (2, 3) or (picture.ndim == 3 and picture.shape[2] != 3):
+        raise ValueError(
+            f"picture: expected uint8 [H, W] or [H, W, 3], got {picture.dtype} {picture.shape}; "
+            f"floats in 0..1 are multiplied by 255 and rounded, channels come last"
+        )
 
     buffer = io.BytesIO()
     Image.fromarray(picture).save(buffer, kind, **options)

@@ -162,7 +162,7 @@ def evaluate(
     chosen = preset if isinstance(preset, Preset) else find_preset(preset)
     pred, truth = (_color_image(image, name, hdr) for image, name in ((pred, "pred"), (truth, "truth")))
     check_images(pred, truth, mixed=True)
-    if not hdr and pred.dtype == truth.dtype:
+    if not hdr and (pred.dtype == np.uint8) == (truth.dtype == np.uint8):
         check_brightness(pred, truth)
     as_background(background, 3)
     given = {name: _checked_region(region, pred.shape) for name, region in (regions or {"full": None}).items()}

@@ -46,22 +46,27 @@ def check_range(
     data_range: float = 1.0,
     below: float = OVERSHOOT,
     above: float = OVERSHOOT,
+    otherwise: str = "; hdr=True takes any range as it is",
 ) -> None:
     """Raise `ValueError`, with the word that mends it, where floats leave [0, data_range] by more than a share of it.
 
     Pixels that are not finite are left to the metrics.
     """
-
-    def fits(low: float, high: float) -> bool:
-        return low >= -below * data_range and high <= (1 + above) * data_range
-
     if image.dtype == np.uint8:
         return
-    low, high = extent(image)
-    if not fits(low, high) and mask is not None:  # only then, since selecting takes longer than looking at all
-        low, high = extent(image[mask])
-    if fits(low, high):
-        return
+    fault = range_fault(*extent(image), data_range, below, above)
+    if fault and mask is not None:  # only then, since selecting takes longer than looking at all
+        fault = range_fault(*extent(image[mask]), data_range, below, above)
+    if fault:
+        raise ValueError(f"{name}: {fault}{otherwise}")
+
+
+def range_fault(
+    low: float, high: float, data_range: float = 1.0, below: float = OVERSHOOT, above: float = OVERSHOOT
+) -> str:
+    """What is wrong with floats from `low` to `high` as an image, and the word that mends it; "" for nothing."""
+    if low >= -below * data_range and high <= (1 + above) * data_range:
+        return ""
     if low >= -below and 2 < high <= 255.5:
         word = "8-bit values are divided by 255"
     elif low >= -below and 255.5 < high <= 65535.5:
@@ -72,10 +77,7 @@ def check_range(
         word = "undo a normalisation by mean and deviation"
     else:
         word = "clip it"
-    raise ValueError(
-        f"{name}: expected floats from 0 to {data_range:g}, got {low:.4g} to {high:.4g}; "
-        f"{word}; hdr=True takes any range as it is"
-    )
+    return f"expected floats from 0 to {data_range:g}, got {low:.4g} to {high:.4g}; {word}"
 
 
 def extent(image: NDArray) -> tuple[float, float]:

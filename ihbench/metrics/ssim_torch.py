@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ihbench.metrics.images import range_fault
 from ihbench.metrics.ssim import K1, K2, Window
 
 
@@ -21,13 +24,25 @@ def ssim_map_torch(
 
     Half precision is raised to float32; float64 stays. Sums are centred on the middle of the range, which keeps the
     cancellation in E[s²] - E[s]² small: in float32 a variance may come out 1e-7 below zero on a flat patch, against
-    C2 = 9e-4, so no division comes near zero. Raises `ValueError` for shapes that do not match.
+    C2 = 9e-4, so no division comes near zero. Raises `ValueError` for shapes that do not match, channels that come
+    last, integers, and a truth outside the range (a prediction in training may leave it).
     """
     if pred.shape != truth.shape or pred.ndim < 3:
         raise ValueError(
             f"images: expected two of the same shape [..., C, H, W], got {tuple(pred.shape)}, {tuple(truth.shape)}"
         )
-    taps = Window(window, sigma).weights
+    if pred.shape[-1] in (1, 3) and pred.shape[-3] not in (1, 3):
+        raise ValueError(
+            f"images: expected [..., C, H, W], got {tuple(pred.shape)}; move the channels before H and W"
+        )
+    if not (pred.is_floating_point() and truth.is_floating_point()):
+        raise ValueError(f"images: expected floats, got {pred.dtype}, {truth.dtype}; divide uint8 by 255")
+    if truth.numel():
+        low, high = torch.stack(torch.aminmax(truth.detach())).tolist()
+        fault = range_fault(low, high, data_range, below=0.5, above=1.0)
+        if fault and math.isfinite(low + high):
+            raise ValueError(f"truth: {fault}")
+    taps = Window(window, sigma, data_range).weights
     dtype = torch.promote_types(torch.promote_types(pred.dtype, truth.dtype), torch.float32)
     height, width = pred.shape[-2:]
     x, y = (image.to(dtype).reshape(-1, 1, height, width) for image in (pred, truth))

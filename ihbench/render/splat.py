@@ -13,6 +13,7 @@ The Gaussians are the paper's: a centre, one scale, a colour, opacity 1. What ev
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -60,7 +61,8 @@ def render_gaussians(
     zero gradient: one bad Gaussian must not blacken the picture. Whoever trains checks the parameters for finiteness.
 
     Raises ValueError for a camera with lens distortion (undistort the image, use `camera.undistorted()`), for wrong
-    shapes and for an unknown back end; ImportError or RuntimeError where the asked-for back end cannot run here.
+    shapes, for negative scales and 8-bit colours, and for an unknown back end; ImportError or RuntimeError where the
+    asked-for back end cannot run here.
     """
     background = _check(means, scales, colors, camera, background)
     backend = _choose_backend(backend, means.device)
@@ -133,16 +135,39 @@ def _check(
     means: Tensor, scales: Tensor, colors: Tensor, camera: Camera, background: Sequence[float] | Tensor
 ) -> Tensor:
     """Raise ValueError for what cannot be drawn; the background as [C] in the dtype and on the device of `means`."""
+    if not isinstance(camera, Camera):
+        raise ValueError(f"splat camera: expected an ihbench.camera.Camera, got {type(camera).__name__}")
     if camera.distortion is not None:
         raise ValueError(
             "splat camera: expected no lens distortion; undistort the image and use camera.undistorted()"
         )
-    n = len(means)
+    for name, tensor in (("means", means), ("scales", scales), ("colors", colors)):
+        if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
+            kind = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
+            raise ValueError(f"splats: {name}: expected a tensor of floats, got {kind}; colours are in 0..1")
+        if tensor.device != means.device:
+            raise ValueError(f"splats: {name} are on {tensor.device}, means on {means.device}; move them together")
+    n = len(means) if means.ndim else 0
     if means.shape != (n, 3) or scales.shape != (n,) or colors.ndim != 2 or len(colors) != n or colors.shape[1] < 1:
+        word = ""
+        if scales.shape in ((n, 1), (n, 3)):
+            word = "; Gaussians are isotropic here, one scale each"
+        elif means.ndim == 2 and means.shape[0] == 3:
+            word = "; one row a Gaussian: transpose"
         raise ValueError(
             "splats: expected means [N, 3], scales [N], colors [N, C], got "
-            f"{list(means.shape)}, {list(scales.shape)}, {list(colors.shape)}"
+            f"{list(means.shape)}, {list(scales.shape)}, {list(colors.shape)}{word}"
         )
+    if n:
+        # NaN is neither: a Gaussian that is not finite is not drawn
+        smallest, brightest = torch.stack([scales.detach().amin().double(), colors.detach().amax().double()]).tolist()
+        if -math.inf < smallest < 0:
+            raise ValueError(
+                f"splats: scales: expected standard deviations in metres, got {smallest:.4g}; "
+                f"logarithms, as splat files hold them, go through exp()"
+            )
+        if colors.shape[1] == 3 and 16 < brightest < 256:
+            raise ValueError(f"splats: colors: expected values in 0..1, got up to {brightest:.4g}; divide by 255")
     background = torch.as_tensor(background, dtype=torch.float64).detach().to(means.device)
     channels = colors.shape[1]
     if background.numel() not in (1, channels):

@@ -50,8 +50,12 @@ def rasterize(
 
     A pixel belongs to a triangle when its centre (+0.5) lies inside or on the edge; the nearest depth wins, the lower
     face index breaks a tie. Both faces of a triangle are drawn. Triangles that touch the near plane, have no area or
-    carry a non-finite corner are dropped. `backend` is "numba", "numpy" or "auto" (numba when importable).
+    carry a non-finite corner are dropped. `backend` is "numba", "numpy" or "auto" (numba when importable). Raises
+    `ValueError` for other shapes and for faces that name no point.
     """
+    check_mesh(points, faces, "z-buffer")
+    if min(height, width) < 1:
+        raise ValueError(f"z-buffer: expected an image of at least 1×1 px, got {height} rows, {width} columns")
     points = np.ascontiguousarray(points, np.float64)
     faces = np.ascontiguousarray(faces, np.int32)
     if backend == "auto":
@@ -71,8 +75,26 @@ def rasterize(
     return Raster(face, bary, depth.astype(np.float32))
 
 
+def check_mesh(points: NDArray, faces: NDArray, where: str) -> None:
+    """Raise `ValueError` unless points are [V, 3] numbers and faces [F, 3] whole numbers below V."""
+    points, faces = np.asarray(points), np.asarray(faces)
+    if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "iuf":
+        word = "; a depth belongs to every pixel place (Camera.project)" if points.shape[-1:] == (2,) else ""
+        raise ValueError(f"{where}: expected points [V, 3], got {points.dtype} {list(points.shape)}{word}")
+    if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
+        raise ValueError(f"{where}: expected faces [F, 3] of whole numbers, got {faces.dtype} {list(faces.shape)}")
+    if faces.size and (faces.min() < 0 or faces.max() >= len(points)):
+        word = "; OBJ files count from 1: subtract 1" if faces.min() == 1 and faces.max() == len(points) else ""
+        raise ValueError(
+            f"{where}: expected faces that name points 0 to {len(points) - 1}, "
+            f"got {faces.min()} to {faces.max()}{word}"
+        )
+
+
 def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> NDArray[np.float64]:
-    """[V, 3] unit normals, area-weighted over the faces around each vertex; 0 where there is no area."""
+    """[V, 3] unit normals, area-weighted over the faces around each vertex; 0 where there is no area. Raises as
+    `rasterize`."""
+    check_mesh(vertices, faces, "normals")
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     n = np.cross(b - a, c - a)
     out = np.zeros_like(vertices, dtype=np.float64)

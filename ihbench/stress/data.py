@@ -163,8 +163,8 @@ def _short_capture() -> Answer:
 
 def _behind_camera() -> Answer:
     """A body behind the camera faces nobody, and nothing divides by its depth."""
-    camera = a_camera()
-    view = train_view(Camera(camera.K, -camera.R, -camera.t, SIZE, SIZE), a_pose())
+    camera, about = a_camera(), np.diag([-1.0, 1, -1])
+    view = train_view(Camera(camera.K, about @ camera.R, about @ camera.t, SIZE, SIZE), a_pose())
     seen = texel_visibility([view], the_body(), texel_table(the_body(), 64))
     return Answer([int(seen.faced.sum()), int(seen.seen.sum())], 0)
 

@@ -242,8 +242,8 @@ def _nothing(hidden: bool) -> Answer:
 
 def _behind() -> Answer:
     """In one view the body is behind the camera."""
-    camera = views()[0].camera
-    behind = replace(views()[1], camera=Camera(camera.K, -camera.R, -camera.t, SIZE, SIZE))
+    camera, about = views()[0].camera, np.diag([-1.0, 1, -1])
+    behind = replace(views()[1], camera=Camera(camera.K, about @ camera.R, about @ camera.t, SIZE, SIZE))
     training = training_set([views()[0], behind, *views()[2:]])
     return _ratio(TINY, training)
 

@@ -1,8 +1,11 @@
+import cv2
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 
 from ihbench.camera import Camera, look_at
+from ihbench.errors import BadInput
 
 DISTORTION = np.array([-0.12, 0.06, 1e-3, -8e-4, 0.01])
 
@@ -56,7 +59,18 @@ def test_look_at_is_a_rotation_with_up_in_the_upper_image_half():
         ({"K": np.eye(2)}, "K"),
         ({"t": np.array([0, np.nan, 0])}, "t"),
         ({"width": 0}, "size"),
-        ({"distortion": np.zeros(4)}, "distortion"),
+        ({"distortion": np.zeros(4)}, "distortion.*from_opencv"),
+        ({"t": np.zeros((3, 1))}, "t.*from_opencv"),
+        ({"R": np.zeros(3)}, "R.*from_opencv"),
+        ({"R": 2 * np.eye(3)}, "R Rᵀ = 1"),
+        ({"R": np.diag([1.0, 1, -1])}, "reflection"),
+        ({"K": np.diag([-1.0, 1, 1])}, "check the signs"),
+        ({"K": np.array([[1, 0, 0], [0, 1, 0], [5, 4, 1.0]])}, "transposed"),
+        ({"K": np.diag([1.0, 1, 2])}, "check the signs"),
+        ({"width": 4.0}, "whole numbers"),
+        ({"height": True}, "whole numbers"),
+        ({"K": "abc"}, "expected numbers"),
+        ({"t": [None, 0, 0]}, "expected numbers"),
     ],
 )
 def test_wrong_shapes_and_values_are_refused_by_name(change, word):
@@ -73,3 +87,52 @@ def test_a_view_along_its_own_up_is_refused_and_not_nan(eye, target):
         look_at(np.array(eye, float), np.array(target, float))
     R, _ = look_at(np.array([1e-6, 3.0, 0.0]), np.zeros(3))
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
+
+
+OPENCV = {"K": np.array([[70.0, 0, 30], [0, 72, 25], [0, 0, 1]]), "R": np.array([0.1, -0.2, 0.3])}
+LENS = np.array([0.1, -0.02, 1e-3, 2e-3, 0.05])
+
+
+@pytest.mark.parametrize("column", [np.ravel, lambda x: np.reshape(x, (-1, 1)), lambda x: np.reshape(x, (1, -1))])
+@pytest.mark.parametrize("kind", [np.asarray, np.ndarray.tolist, torch.tensor, lambda x: x.astype(np.float32)])
+@pytest.mark.parametrize("zeros", [0, 3, 7, 9])
+def test_an_opencv_calibration_is_taken_as_opencv_writes_it(column, kind, zeros):
+    matrix = Rotation.from_rotvec(OPENCV["R"]).as_matrix()
+    plain = Camera(OPENCV["K"] + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], matrix, np.array([1.0, 2, 3]), 60, 50, LENS)
+    vector = column(OPENCV["R"])
+    for R in (kind(vector), kind(matrix)):
+        lens = kind(column(np.pad(LENS, (0, zeros))))
+        camera = Camera.from_opencv(kind(OPENCV["K"]), R, kind(column(np.array([1.0, 2, 3]))), 60, 50, lens)
+        for name in ("K", "R", "t", "distortion"):
+            np.testing.assert_allclose(getattr(camera, name), getattr(plain, name), atol=1e-7)
+        projected = cv2.projectPoints(np.array([[0.1, 0.2, 2.0]]), vector, camera.t, OPENCV["K"], LENS)[0]
+        np.testing.assert_allclose(camera.project(np.array([0.1, 0.2, 2.0]))[:2] - 0.5, projected[0, 0], atol=1e-4)
+
+
+def test_a_short_distortion_is_filled_and_zeros_are_none():
+    def lens(values):
+        return Camera.from_opencv(OPENCV["K"], np.eye(3), np.zeros(3), 60, 50, values).distortion
+
+    np.testing.assert_array_equal(lens(LENS[:4]), [*LENS[:4], 0])
+    for none in (None, [], np.zeros((1, 5)), np.zeros((14, 1))):
+        assert lens(none) is None
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"distortion": np.ones(8)}, "cv2.undistort"),
+        ({"distortion": [0.1] * 6}, "fisheye"),
+        ({"K": np.array([70.0, 72, 30, 25])}, "fx, 0, cx"),
+        ({"K": np.eye(4)}, "shape"),
+        ({"t": np.zeros((3, 4))}, "its last column is t"),
+        ({"t": np.zeros(2)}, "three numbers"),
+        ({"R": np.eye(4)}, "shape"),
+        ({"R": np.full(3, np.nan)}, "NaN"),
+    ],
+)
+def test_an_opencv_calibration_that_cannot_be_kept_is_refused(change, word):
+    with pytest.raises(BadInput, match=word) as error:
+        Camera.from_opencv(**{**OPENCV, "t": np.zeros(3), "width": 60, "height": 50, **change})
+    assert isinstance(error.value, ValueError)
+    assert "\n" not in str(error.value)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from ihbench import scoring
 from ihbench.errors import BadInput
@@ -73,6 +74,40 @@ def test_another_size_is_refused(scorer):
     loaded = scorer.load(0)
     with pytest.raises(BadInput, match=r"cam1/000000.*\(10, 48, 3\).*\(48, 48, 3\)"):
         scorer.score(loaded, np.zeros((10, 48, 3), np.float32))
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        (lambda x: x * 255, "divided by 255"),
+        (lambda x: 2 * x - 1, r"\(image \+ 1\) / 2"),
+        (lambda x: x.transpose(2, 0, 1), "move axis 0 to the end"),
+        (lambda x: np.dstack([x, x[..., :1]]), "composite RGBA"),
+        (lambda x: x[None], "batch"),
+        (lambda x: x[..., 0], "expected"),
+        (lambda x: (x * 255).astype(np.int64), "uint8"),
+        (lambda x: x.tolist(), "list"),
+    ],
+)
+def test_a_render_of_another_range_or_layout_is_refused_by_view(scorer, change, word):
+    loaded = scorer.load(0)
+    with pytest.raises(BadInput, match=f"cam1/000000.*{word}") as error:
+        scorer.score(loaded, change(loaded.view.image))
+    assert "hdr" not in str(error.value)
+    with pytest.raises(BadInput, match=word):
+        list(scorer.scored({"a": lambda loaded: change(loaded.view.image)}, [0]))
+
+
+def test_a_render_may_be_a_tensor_or_overshoot_and_is_handed_on_as_an_array(scorer):
+    loaded = scorer.load(0)
+    image = loaded.view.image
+    for render in (torch.tensor(image, requires_grad=True), image + np.where(image > 0.5, 0.6, -0.3)):
+        (scored,) = scorer.scored({"a": lambda loaded, render=render: render}, [0])
+        assert isinstance(scored.images["a"], np.ndarray)
+        clipped = scorer.score(loaded, scored.images["a"].clip(0, 1)).scores
+        assert {k: s.value for k, s in scored.scores["a"].scores.items() if not s.absent} == {
+            k: s.value for k, s in clipped.items() if not s.absent
+        }
 
 
 def truth_of(loaded):

@@ -6,6 +6,7 @@ import torch
 
 from ihbench.body import chart_padding, load_body, position_map, sample_uv, texel_table
 from ihbench.body.uv import grid_sample_coordinates, map_coordinates
+from ihbench.scene import BodyPose
 
 
 def padded(values: np.ndarray, index: np.ndarray) -> np.ndarray:
@@ -142,3 +143,31 @@ def test_padding_copies_from_the_nearest_chart_texel(texels):
 
 def test_padding_of_an_empty_mask_is_empty():
     assert (chart_padding(np.zeros((4, 4), bool), 3) == -1).all()
+
+
+def test_other_shapes_are_refused():
+    body, flat = load_body(), np.zeros((8, 8, 3))
+    for wrong in (lambda: sample_uv(flat.transpose(2, 0, 1), np.zeros((2, 2))), lambda: sample_uv(flat, np.zeros(2))):
+        with pytest.raises(ValueError, match=r"map \[R, R, C\], channels last, and uv \[N, 2\]"):
+            wrong()
+    for size in (0, -3, 7.5):
+        with pytest.raises(ValueError, match="whole number of texels"):
+            texel_table(body, size)
+    with pytest.raises(ValueError, match="vertices"):
+        position_map(body.v_template.T, body, 8)
+    with pytest.raises(ValueError, match="offsets"):
+        body.pose(BodyPose(np.zeros((24, 3)), np.zeros(10), np.zeros(3)), offsets=np.zeros(3))
+
+
+@pytest.mark.parametrize(
+    ("pose", "word"),
+    [
+        (np.zeros(72), "reshape"),
+        (np.zeros((24, 3, 3)), "matrix_to_axis_angle"),
+        (np.zeros((24, 4)), "quaternions"),
+        (np.full((24, 3), 90.0), "np.deg2rad"),
+    ],
+)
+def test_other_poses_are_refused(pose, word):
+    with pytest.raises(ValueError, match=word):
+        BodyPose(pose, np.zeros(10), np.zeros(3))

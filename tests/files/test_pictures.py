@@ -10,7 +10,7 @@ import pytest
 from PIL import Image, ImageCms, PngImagePlugin
 
 from ihbench.errors import BadInput
-from ihbench.files.pictures import read_mask, read_picture, read_rgb, size_of
+from ihbench.files.pictures import encoded, read_mask, read_picture, read_rgb, size_of
 from ihbench.predictions import read_image
 
 RGB = np.random.default_rng(0).integers(1, 255, (6, 5, 3)).astype(np.uint8)
@@ -297,3 +297,11 @@ def test_every_damage_to_a_file_is_bad_input(tmp_path):
                 refused.append(str(error))
     assert 100 < len(refused) < 320
     assert not any("\n" in line for line in refused)
+
+
+@pytest.mark.parametrize(
+    "picture", [np.zeros((4, 5, 3)), np.zeros((3, 4, 5), np.uint8), np.zeros((4, 5, 4), np.uint8)]
+)
+def test_only_8_bit_pictures_are_encoded(picture):
+    with pytest.raises(ValueError, match="multiplied by 255 and rounded, channels come last"):
+        encoded(picture, "PNG")

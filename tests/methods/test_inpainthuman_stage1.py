@@ -392,7 +392,7 @@ def test_one_view_that_shows_a_single_pixel_is_enough(views):
 
 
 def test_a_body_behind_the_camera_does_no_harm(views):
-    camera = views[0].camera
-    behind = Camera(camera.K, -camera.R, -camera.t, SIZE, SIZE)
+    camera, about = views[0].camera, np.diag([-1.0, 1, -1])
+    behind = Camera(camera.K, about @ camera.R, about @ camera.t, SIZE, SIZE)
     avatar = fitted(training_set([views[0], replace(views[1], camera=behind)]), steps=6)
     assert all(p.isfinite().all() for p in avatar.parameters())

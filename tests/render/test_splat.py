@@ -237,3 +237,16 @@ def test_bad_input_is_named():
         render_gaussians(means[:3], scales, colors, camera)
     with pytest.raises(ValueError, match="1 or 3 values, got 2"):
         render_gaussians(means, scales, colors, camera, (1.0, 1.0))
+    for wrong, word in (
+        ((means.numpy(), scales, colors, camera), "means: expected a tensor of floats, got ndarray"),
+        ((means, scales, (colors * 255).byte(), camera), "colors: expected a tensor of floats, got torch.uint8"),
+        ((means, scales.log(), colors, camera), r"exp\(\)"),
+        ((means, scales, colors * 255, camera), "divide by 255"),
+        ((means, scales[:, None].expand(-1, 3), colors, camera), "one scale each"),
+        ((means.T, scales, colors, camera), "transpose"),
+        ((means, scales, colors, camera.K), "Camera"),
+        ((means[0, 0], scales, colors, camera), "expected means"),
+    ):
+        with pytest.raises(ValueError, match=word):
+            render_gaussians(*wrong)
+    render_gaussians(means, scales, colors.repeat(1, 2) * 255, camera, (0.0,))  # features may have any size

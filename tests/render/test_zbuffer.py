@@ -72,3 +72,30 @@ def test_vertex_normals_of_a_tetrahedron_point_outwards():
     assert ((normals * (vertices - vertices.mean(0))).sum(1) > 0).all()
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
     assert not vertex_normals(np.zeros((3, 3)), np.array([[0, 1, 2]])).any()
+
+
+TRIANGLE = np.array([[1.0, 1, 2], [7, 1, 2], [4, 7, 2]])
+
+
+@pytest.mark.parametrize(
+    ("points", "faces", "word"),
+    [
+        (TRIANGLE, [[0, 1, 3]], "0 to 2, got 0 to 3"),
+        (TRIANGLE, [[1, 2, 3]], "OBJ files count from 1"),
+        (TRIANGLE, [[0, 1, -1]], "got -1 to 1"),
+        (TRIANGLE, [[0.0, 1, 2]], "whole numbers"),
+        (TRIANGLE, [[0, 1, 2, 0]], "faces"),
+        (TRIANGLE[:, :2], [[0, 1, 2]], "Camera.project"),
+        (TRIANGLE.astype(complex), [[0, 1, 2]], "points"),
+        (TRIANGLE[0], [[0, 1, 2]], "points"),
+    ],
+)
+@pytest.mark.parametrize("backend", ["numpy", "numba"])
+def test_other_meshes_are_refused(points, faces, word, backend):
+    with pytest.raises(ValueError, match=word):
+        rasterize(points, np.array(faces), 8, 8, backend)
+    if "project" not in word:
+        with pytest.raises(ValueError, match=word):
+            vertex_normals(points, np.array(faces))
+    with pytest.raises(ValueError, match="at least 1×1 px"):
+        rasterize(TRIANGLE, np.array([[0, 1, 2]]), 0, 8, backend)
