@@ -1,4 +1,6 @@
-"""What pose estimators give, as a `Camera` and a `BodyPose`; pure functions, one frame a call.
+"""What pose estimators give, as a `Camera` and a `BodyPose`; pure functions, one person of one frame a call.
+
+Arrays, tensors and lists are taken, with dimensions of one as batches leave them.
 
 All of them pose SMPL in its standard root convention, v = R(theta_0) (v0 - J0) + J0 + t: about the pelvis joint, then
 the translation. EasyMocap alone keeps ZJU-MoCap's root (`root_convention`). Outputs in the camera's frame have OpenCV
@@ -7,6 +9,7 @@ axes (x right, y down, z forward), so an upright person's root is turned by abou
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +17,7 @@ from numpy.typing import NDArray
 
 from ihbench.body.root_convention import from_zju_root
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
-from ihbench.camera import Camera
+from ihbench.camera import Camera, as_numbers, check_intrinsics, check_rotation
 from ihbench.errors import BadInput
 from ihbench.scene import BodyPose
 
@@ -23,13 +26,14 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+SMPLX_PELVIS = (0.0031, -0.3514, 0.0120)  # m, joint 0 of SMPL-X's neutral mean body at rest
 SIX_D_LAYOUTS = ("columns", "interleaved", "rows")
 UP_AXES = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 WORLD_AXES = {f"{sign}{axis}": s * np.eye(3)[k] for k, axis in enumerate("xyz") for sign, s in (("+", 1), ("-", -1))}
 
 
 def from_weak_perspective(
-    pose: Any,  # [72] or [24, 3] rad, root in the camera's frame
+    pose: Any,  # [72] or [24, 3] rad, or rotation matrices [24, 3, 3]; root in the camera's frame
     betas: Any,  # [B]
     scale_translation: Any,  # (s, tx, ty) of the crop camera
     box: Any,  # (cx, cy, size) px: centre and side of the square crop in the full image, whose corner is (0, 0)
@@ -51,7 +55,7 @@ def from_weak_perspective(
     """
     s, tx, ty = _numbers("scale and translation (s, tx, ty)", scale_translation, (3,))
     cx, cy, size = _numbers("crop box (cx, cy, size)", box, (3,))
-    (f,) = _numbers("focal length", np.reshape(focal, -1), (1,))
+    f = float(_numbers("focal length", focal, ()))
     if s <= 0 or size <= 0 or f <= 0:
         raise BadInput(
             f"weak perspective: expected scale, box size and focal length above 0, got {s:.4g}, {size:.4g}, {f:.4g}"
@@ -64,7 +68,7 @@ def from_weak_perspective(
 
 
 def from_camera_space(
-    pose: Any,  # [72] or [24, 3] rad, root in the camera's frame
+    pose: Any,  # [72] or [24, 3] rad, or rotation matrices [24, 3, 3]; root in the camera's frame
     betas: Any,  # [B]
     transl: Any,  # [3] m, in the camera's frame
     K: Any,  # [3, 3] px, or a focal length: then the principal point is the image's centre
@@ -88,7 +92,7 @@ def from_camera_space(
 
 
 def from_world(
-    pose: Any,  # [72] or [24, 3] rad, root in the world
+    pose: Any,  # [72] or [24, 3] rad, or rotation matrices [24, 3, 3]; root in the world
     betas: Any,  # [B]
     transl: Any,  # [3] m, in the world
     R_w2c: Any,  # [3, 3]
@@ -121,6 +125,32 @@ def from_world(
     return Camera(_K(K, width, height, pixel_center), R, t, width, height), body_pose
 
 
+def from_smplx(
+    pose: Any,  # 66, 78, 87, 156, 159 or 165 numbers, or [J, 3], root first; rad
+    transl: Any,  # [3] m
+    body: Body,
+    betas: Any = (0.0,),  # [B] of SMPL
+    pelvis: Any = SMPLX_PELVIS,  # [3] m, joint 0 of the SMPL-X (or SMPL-H) body at rest
+) -> BodyPose:
+    """GVHMR, SMPLer-X, EasyMocap's SMPL-X and others: SMPL's pose of an SMPL-X or SMPL-H one.
+
+    The first 22 joints are the same; SMPL's two hand joints stay straight. The pelvis stays where it was: each model
+    turns about its own, and SMPL-X's lies 0.12 m lower at rest. The shape coefficients are of another body and cannot
+    be taken over: fit SMPL's, or leave the mean shape. Raises `BadInput`.
+    """
+    array = _numbers("SMPL-X pose", pose, None)
+    if array.size not in SMPLX_SIZES or len(_without_ones(array.shape)) > 2:
+        raise BadInput(
+            f"SMPL-X pose: expected {', '.join(map(str, SMPLX_SIZES))} numbers of axis-angle, root first, "
+            f"got {list(array.shape)}; concatenate global_orient and body_pose"
+        )
+    smpl = np.zeros((24, 3))
+    smpl[:22] = array.reshape(-1)[:66].reshape(22, 3)
+    betas = _betas(betas)
+    shift = _numbers("pelvis", pelvis, (3,)) - body.shaped(betas)[1][0]
+    return BodyPose(smpl, betas, _numbers("transl", transl, (3,)) + shift)
+
+
 def from_easymocap(
     poses: Any,  # 72 numbers with a zero root, or 69 without it; rad
     shapes: Any,  # [B]
@@ -135,9 +165,9 @@ def from_easymocap(
     """
     values = _numbers("EasyMocap poses", poses, None).reshape(-1)
     if values.size not in (69, 72):
-        hint = "; these are SMPL-X or SMPL-H poses, fit with --body smpl" if values.size > 72 else ""
+        hint = "; these are SMPL-X or SMPL-H poses, fit with --body smpl" if values.size in SMPLX_SIZES else ""
         raise BadInput(f"EasyMocap poses: expected 72 numbers (or 69 without the root), got {values.size}{hint}")
-    rotation, translation = (_numbers(name, np.reshape(value, -1), (3,)) for name, value in (("Rh", Rh), ("Th", Th)))
+    rotation, translation = (_numbers(name, value, (3,)) for name, value in (("Rh", Rh), ("Th", Th)))
     return from_zju_root(values, _betas(shapes), rotation, translation, body)
 
 
@@ -201,32 +231,82 @@ def _unit(vectors: Array) -> Array:
 
 
 def _numbers(what: str, value: Any, shape: tuple[int, ...] | None) -> Array:
+    """Finite numbers as float64, of this shape (as a row or a column of it, too), or of any."""
     try:
-        array = np.array(value, np.float64)
-    except (TypeError, ValueError):
-        raise BadInput(f"{what}: expected numbers, got a {type(value).__name__} of other contents") from None
-    if shape is not None and array.shape != shape:
-        raise BadInput(f"{what}: expected shape {list(shape)}, got {list(array.shape)}")
-    if not np.isfinite(array).all():
-        raise BadInput(f"{what}: expected finite numbers, got NaN or infinity; leave this frame out")
+        array = as_numbers(value, what)
+    except ValueError as error:
+        raise BadInput(f"{error}; leave a frame without numbers out") from None
+    if shape is None:
+        return array
+    if array.shape != shape and array.size == math.prod(shape) and _without_ones(array.shape) == shape:
+        array = array.reshape(shape)
+    if array.shape != shape:
+        more = array.shape[-len(shape) :] == shape
+        hint = "; give one row a call: these are several frames or persons" if more else ""
+        raise BadInput(f"{what}: expected shape {list(shape)}, got {list(array.shape)}{hint}")
     return array
 
 
+def _without_ones(shape: tuple[int, ...]) -> tuple[int, ...]:
+    return tuple(n for n in shape if n != 1)
+
+
 def _pose(pose: Any) -> Array:
+    """[24, 3] of 72 numbers in any of their shapes, or of rotation matrices [24, 3, 3]."""
     array = _numbers("pose", pose, None)
-    if array.shape not in ((72,), (1, 72), (24, 3)):
-        hint = "; convert rotations with matrix_to_axis_angle" if array.shape[-2:] == (3, 3) else ""
-        raise BadInput(f"pose: expected 72 numbers of axis-angle, [72] or [24, 3], got {list(array.shape)}{hint}")
+    shape = _without_ones(array.shape)
+    if shape == (24, 3, 3):
+        _check_rotations("pose by matrix_to_axis_angle", array)
+        return matrix_to_axis_angle(array.reshape(24, 3, 3))
+    if shape not in ((72,), (24, 3)):
+        raise BadInput(
+            f"pose: expected 72 numbers of axis-angle, [72] or [24, 3], got {list(array.shape)}{_pose_hint(array)}"
+        )
     return array.reshape(24, 3)
+
+
+SMPLX_SIZES = {  # numbers of a pose whose first 22 joints are SMPL's -> whose it is
+    66: "SMPL-X or SMPL-H without hands, as GVHMR writes them",
+    78: "EasyMocap's SMPL-H",
+    87: "EasyMocap's SMPL-X",
+    156: "SMPL-H",
+    159: "SMPL-X without the root's frame",
+    165: "SMPL-X",
+}
+
+
+def _pose_hint(array: Array) -> str:
+    """What a pose of another size probably is, and what to take of it."""
+    shape = _without_ones(array.shape)
+    numbers = shape[-2] * 3 if len(shape) > 1 and shape[-1] == 3 else (shape or (1,))[-1]
+    if shape[-2:] == (3, 3):
+        return (
+            "; convert 24 rotations, root first, with matrix_to_axis_angle (concatenate global_orient and body_pose)"
+        )
+    if shape[-1:] == (6,):
+        return "; 6D rotations are turned by six_d_to_matrix and matrix_to_axis_angle"
+    if shape[-1:] == (4,):
+        return "; quaternions are turned into axis-angle first"
+    if numbers == 72:
+        return f"; give one row a call: these are {array.size // 72} frames or persons"
+    if numbers == 69:
+        return "; 69 are SMPL's 23 joints without the root: put global_orient in front"
+    if numbers == 63:
+        return "; 63 are the body of SMPL-X without the root: put global_orient in front, then see from_smplx"
+    if numbers in SMPLX_SIZES:
+        return f"; {numbers} are {SMPLX_SIZES[numbers]}: from_smplx takes the 22 joints that SMPL shares"
+    if array.size in (216, 144, 96):
+        kind = {216: "rotation matrices", 144: "6D rotations", 96: "quaternions"}[array.size]
+        return f"; {array.size} may be 24 {kind}: reshape and convert them"
+    return ""
 
 
 def _betas(betas: Any) -> Array:
     array = _numbers("betas", betas, None)
-    if array.ndim == 2 and len(array) == 1:
-        array = array[0]
-    if array.ndim != 1 or array.size == 0:
-        raise BadInput(f"betas: expected shape [B], got {list(array.shape)}")
-    return array
+    if array.size == 0 or array.ndim == 0 or len(_without_ones(array.shape)) > 1:
+        more = "; give one row a call: these are several frames or persons" if array.ndim == 2 and array.size else ""
+        raise BadInput(f"betas: expected shape [B], got {list(array.shape)}{more}")
+    return array.reshape(-1)
 
 
 def _size(width: Any, height: Any) -> tuple[int, int]:
@@ -241,10 +321,13 @@ def _K(K: Any, width: int, height: int, pixel_center: float) -> Array:
     if matrix.size == 1:
         f = float(matrix.reshape(()))
         matrix, pixel_center = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]]), 0.5
-    if matrix.shape != (3, 3):
-        raise BadInput(f"K: expected shape [3, 3] or a focal length, got {list(matrix.shape)}")
-    if matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or matrix[1, 0] != 0 or not np.array_equal(matrix[2], [0, 0, 1]):
-        raise BadInput("K: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0")
+    if _without_ones(matrix.shape) != (3, 3):
+        raise BadInput(f"K: expected shape [3, 3] or a focal length, got {list(matrix.shape)}; give one frame's")
+    matrix = matrix.reshape(3, 3)
+    try:
+        check_intrinsics(matrix, "K")
+    except ValueError as error:
+        raise BadInput(str(error)) from None
     if pixel_center not in (0.0, 0.5):
         raise BadInput(f"pixel_center {pixel_center!r}: expected 0.0 or 0.5")
     matrix[:2, 2] += 0.5 - pixel_center
@@ -252,6 +335,7 @@ def _K(K: Any, width: int, height: int, pixel_center: float) -> Array:
 
 
 def _check_rotations(what: str, R: Array) -> None:
-    off = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3))
-    if (off > 1e-2).any() or (np.linalg.det(R) < 0).any():
-        raise BadInput(f"{what}: expected rotations (R Rᵀ = 1, determinant 1), got another matrix")
+    try:
+        check_rotation(R, what)
+    except ValueError as error:
+        raise BadInput(str(error)) from None

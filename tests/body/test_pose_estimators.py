@@ -4,12 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 
 from ihbench.body import load_body, zju_root
 from ihbench.body.pose_estimators import (
     from_camera_space,
     from_easymocap,
+    from_smplx,
     from_weak_perspective,
     from_world,
     matrix_to_axis_angle,
@@ -233,7 +235,7 @@ def test_a_lying_person_and_a_camera_that_looks_down_are_fine():
         ({"R_w2c": 2 * np.eye(3)}, "expected rotations"),
         ({"R_w2c": np.eye(4)}, "shape"),
         ({"t_w2c": [0, 0, np.nan]}, "NaN"),
-        ({"transl": np.zeros((1, 3))}, "transl"),
+        ({"transl": np.zeros((2, 3))}, "transl.*one row a call"),
     ],
 )
 def test_wrong_worlds_are_bad_input(change, text):
@@ -364,3 +366,67 @@ def test_wrong_six_numbers_are_bad_input():
         with pytest.raises(BadInput, match=text) as error:
             six_d_to_matrix(values, layout)
         message(error)
+
+
+# ---------------------------------------------------------------- what estimators write, shape by shape
+
+
+def test_batches_columns_tensors_and_rotation_matrices_are_taken():
+    pose, transl = camera_pose(4).reshape(24, 3), np.array([0.1, 0.2, 3.0])
+    plain = from_camera_space(pose, np.linspace(-1, 1, 10), transl, K, WIDTH, HEIGHT)
+    tensor = torch.tensor(pose, dtype=torch.float64, requires_grad=True)
+    for given in (pose[None], pose.reshape(1, 72), pose.reshape(72, 1), pose.tolist(), tensor, tensor[None]):
+        camera, body_pose = from_camera_space(
+            given, torch.linspace(-1, 1, 10, dtype=torch.float64)[None], transl[:, None], K[None], WIDTH, HEIGHT
+        )
+        np.testing.assert_array_equal(body_pose.pose, plain[1].pose)
+        np.testing.assert_array_equal(body_pose.transl, plain[1].transl)
+        np.testing.assert_allclose(body_pose.betas, plain[1].betas)
+        np.testing.assert_array_equal(camera.K, plain[0].K)
+    matrices = axis_angle_to_matrix(pose)  # 4D-Humans: global_orient [1, 1, 3, 3], body_pose [1, 23, 3, 3]
+    both = torch.cat([torch.tensor(matrices[None, :1]), torch.tensor(matrices[None, 1:])], 1).float()
+    turned = from_weak_perspective(
+        both, np.zeros((1, 10)), [[0.9, 0, 0]], [[320.0, 240, 200]], [900.0], WIDTH, HEIGHT
+    )
+    np.testing.assert_allclose(axis_angle_to_matrix(turned[1].pose), matrices, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("pose", "words"),
+    [
+        (np.zeros(63), "SMPL-X without the root"),
+        (np.zeros(66), "GVHMR.*from_smplx"),
+        (np.zeros((22, 3)), "GVHMR.*from_smplx"),
+        (np.zeros((1, 1, 66)), "from_smplx"),
+        (np.zeros(69), "without the root"),
+        (np.zeros((23, 3)), "without the root"),
+        (np.zeros(156), "SMPL-H.*from_smplx"),
+        (np.zeros((52, 3)), "SMPL-H.*from_smplx"),
+        (np.zeros(165), "SMPL-X.*from_smplx"),
+        (np.zeros((55, 3)), "SMPL-X.*from_smplx"),
+        (np.zeros((5, 72)), "5 frames or persons"),
+        (np.zeros((2, 24, 3)), "2 frames or persons"),
+        (np.zeros((23, 3, 3)), "matrix_to_axis_angle"),
+        (np.zeros((24, 6)), "six_d_to_matrix"),
+        (np.zeros((24, 4)), "quaternions"),
+        (np.zeros(216), "24 rotation matrices"),
+        (np.full((24, 3), 90.0), "np.deg2rad"),
+    ],
+)
+def test_a_pose_of_another_body_or_kind_says_what_it_is(pose, words):
+    for given in (pose, torch.tensor(pose)):
+        with pytest.raises(BadInput, match=words):
+            from_camera_space(given, np.zeros(10), [0, 0, 3], K, WIDTH, HEIGHT)
+
+
+@pytest.mark.parametrize("size", [66, 78, 87, 156, 159, 165])
+def test_the_joints_that_smplx_shares_are_taken_and_the_pelvis_stays(size):
+    body, pose = off_centre_body(), 0.1 * np.random.default_rng(size).normal(size=size)
+    pelvis, transl = np.array([0.0, -0.4, 0.1]), np.array([1.0, 2, 3])
+    taken = from_smplx(pose[None], transl, body, pelvis=pelvis)
+    np.testing.assert_array_equal(taken.pose[:22].ravel(), pose[:66])
+    assert not taken.pose[22:].any()
+    np.testing.assert_allclose(body.posed_joints(taken)[0], pelvis + transl, atol=1e-12)
+    for wrong in (np.zeros(72), np.zeros(63), np.zeros((3, 66))):
+        with pytest.raises(BadInput, match="SMPL-X pose: expected 66"):
+            from_smplx(wrong, transl, body)
