@@ -105,7 +105,7 @@ class W2aCapture(OneCameraCapture):
         files = _image_files(folder / "images", may_lack=bool(self.standin))
         self.frame_names = _frame_names(files, self._metadata, folder, bool(self.standin))
         self.n_frames = len(self.frame_names)
-        self.camera_ids = (_camera_id(folder.name),)
+        self.camera_ids = (camera_id(folder.name),)
         self._images = tuple(files.get(name, folder / "images" / f"{name}.png") for name in self.frame_names)
         self._masks = tuple(folder / "masks" / f"{name}.png" for name in self.frame_names)
         where = [self._where(name) for name in self.frame_names]
@@ -184,7 +184,7 @@ def _is_sequence(folder: Path) -> bool:
     return (named and pictures) or ((folder / METADATA).is_file() and (named or pictures))
 
 
-def _camera_id(name: str) -> str:
+def camera_id(name: str) -> str:
     """0011_02_1_w2a -> 02: the second part, as OccFusion takes it."""
     parts = name.split("_")
     return parts[1] if len(parts) > 2 and parts[1].isdecimal() else "camera"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ihbench import registry
 from ihbench.body import Body, load_body
@@ -13,6 +14,9 @@ from ihbench.paths import path_from, user_path
 from ihbench.progress import Progress
 from ihbench.protocol import Protocol
 from ihbench.scene import Capture
+
+if TYPE_CHECKING:
+    from ihbench.views import TestViewKey
 
 STANDIN_SEED = 0
 
@@ -51,6 +55,16 @@ class DataSource:
         if self.is_standin:
             self.make_standin([scene], progress)
         return open_capture(self.protocol.dataset, self.root, scene, body)
+
+    def test_keys(self, scene: str) -> tuple[TestViewKey, ...]:
+        """The test views of a scene. No image is read, and none made of a stand-in."""
+        from ihbench.views import test_view_keys
+
+        if self.is_standin:
+            standin = registry.load("stand-in", self.protocol.dataset)
+            return test_view_keys(self.protocol, scene, standin.n_frames, standin.camera_ids(scene))
+        capture = registry.load("dataset", self.protocol.dataset)(self.root).open(scene)
+        return test_view_keys(self.protocol, scene, capture.n_frames, capture.camera_ids)
 
     def make_standin(self, scenes: list[str], progress: Progress) -> None:
         """Write what the protocol needs of these stand-in subjects and is not there yet."""

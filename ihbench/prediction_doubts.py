@@ -91,7 +91,6 @@ class Doubts:
         """A line for each thing that nearly all predictions have in common."""
         looks = [look for _, look in sorted(self._looks.items())]
         doubted = [look for look in looks if look.error > LEAST_ERROR]
-        notes = []
         seen = [look.background for look in looks if look.background is not None]
         others = [not (np.abs(colour - self._background) <= 2 * SAME).all() for colour in seen]
         if seen and np.mean(others) >= MOST:
@@ -99,14 +98,11 @@ class Doubts:
                 ", ".join(f"{value * 255:.0f}" for value in colour)
                 for colour in (np.median(np.stack(seen), 0), self._background)
             )
-            notes = [f"predictions have the background ({said}), the protocol's is ({meant})"]
-        if doubted and len(doubted) >= MOST * len(looks):
-            likely = [*_changed(doubted), *_exchanged(doubted, looks)]
-            if likely:
-                notes.append(min(likely)[1])
-            elif not notes:
-                notes = _shifted(doubted)
-        return notes
+            return [f"predictions have the background ({said}), the protocol's is ({meant})"]  # spoils the rest
+        if len(doubted) < max(1, MOST * len(looks)):
+            return []
+        likely = [*_changed(doubted), *_exchanged(doubted, looks)]
+        return [min(likely)[1]] if likely else _shifted(doubted)
 
 
 def _changed(looks: list[_Look]) -> Iterator[tuple[float, str]]:
@@ -156,10 +152,12 @@ def _moved(image: NDArray, truth: NDArray) -> NDArray[np.float64]:
         return np.zeros(2)
     down, right = np.gradient((image + truth) / 2)
     slopes = np.stack([right.ravel(), down.ravel()], 1).astype(np.float64)
-    return np.linalg.lstsq(slopes.T @ slopes, slopes.T @ (truth - image).ravel().astype(np.float64), rcond=1e-6)[0]
+    solution = np.linalg.lstsq(slopes.T @ slopes, slopes.T @ (truth - image).ravel(), rcond=1e-6)[0]
+    return solution.astype(np.float64)
 
 
 def _small(image: NDArray) -> NDArray[np.float32]:
     import cv2
 
-    return np.asarray(cv2.resize(image.astype(np.float32), (SMALL, SMALL), interpolation=cv2.INTER_AREA)).ravel()
+    small = cv2.resize(image.astype(np.float32), (SMALL, SMALL), interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.float32).ravel()

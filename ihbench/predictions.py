@@ -18,7 +18,8 @@ from __future__ import annotations
 
 import hashlib
 import string
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -37,6 +38,7 @@ PLACEHOLDERS = ("scene", "camera", "camera_index", "frame", "index")
 SUFFIXES = (".png", ".jpg", ".jpeg", ".npy")
 ALPHAS = ("straight", "premultiplied", "composited")
 ROUNDING = 2 / 255, 16 / 255  # of colours, in files with and without loss
+MOST_SIZES = 100  # images of a scene whose size is looked at
 SOME = 0.01  # share of pixels: fewer may be colours beyond white, which renderers clip
 ENOUGH = 2000  # half transparent pixels
 
@@ -124,6 +126,28 @@ def image_files(root: Path) -> list[Path]:
     if not root.is_dir():
         raise BadInput(f"predictions {root}: no such folder; expected one image a test view")
     return sorted(p for p in root.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
+
+
+def size_of_most(
+    root: Path, scenes: Mapping[str, Sequence[TestViewKey]], pattern: str | None = None
+) -> tuple[int, int]:
+    """(longer side in px of most images of these test views, how many images there are); (0, 0) without any.
+
+    Files that no view expects are not looked at. Raises `BadInput` for a pattern as `find_predictions` does.
+    """
+    sides: Counter[int] = Counter()
+    count = 0
+    for scene, keys in scenes.items():
+        for one in DEFAULT_PATTERNS if pattern is None else (pattern,):
+            paths = [root / name for name in dict.fromkeys(_expected(one, scene, keys)[1].values())]
+            paths = [path for path in paths if path.is_file()]
+            count += len(paths)
+            sides.update(_longer_side(path) for path in paths[:MOST_SIZES])
+    return (sides.most_common(1)[0][0], count) if sides else (0, 0)
+
+
+def _longer_side(path: Path) -> int:
+    return max(_read(path).shape[:2]) if path.suffix.lower() == ".npy" else max(_header(path).size)
 
 
 def expected_names(pattern: str | None, scene: str, keys: Sequence[TestViewKey]) -> list[str]:
@@ -266,7 +290,7 @@ def _expected(pattern: str, scene: str, keys: Sequence[TestViewKey]) -> tuple[st
     path = PurePosixPath(next(iter(names.values()), "x"))
     if path.is_absolute() or ".." in path.parts:
         raise BadInput(f"--pattern {pattern!r}: leads out of the folder; expected a path below it")
-    if len(set(names.values())) < len(names):
+    if len(set(names.values())) < len({(key.camera, key.frame) for key in names}):  # groups may share a view
         raise BadInput(
             f"--pattern {pattern!r}: names one file for several views; use {{camera}} and {{frame}}, or {{index}}"
         )

@@ -31,6 +31,14 @@ from ihbench.views import OccludedScene
 
 MANIFEST = "manifest.json"
 TEST_VIEWS = "test_views.json"
+PIXEL_CENTER = 0.0  # of K in test_views.json, as OpenCV
+CONVENTIONS = (  # of every row of test_views.json
+    "K: px, the centre of the first pixel at (pixel_center, pixel_center); where yours is at (0.5, 0.5) add 0.5 to "
+    "cx and cy. distortion: OpenCV's k1 k2 p1 p2 k3. x_camera = R x_world + t, metres, x right, y down, z forward. "
+    "pose: axis-angle, radians, root first. The root is SMPL's own (pose, transl) or ZJU-MoCap's (Rh, Th): "
+    "v = R(Rh) v0 + Th, v0 with a zero root. Draw width x height px, sRGB, on background (RGB in [0, 1]), or "
+    "transparent."
+)
 UNKNOWN_FOLDER = "unknown"  # masks of what the occluder hides, beside the layout's own files
 
 
@@ -69,6 +77,8 @@ def prepare(
     progress: Progress,
     force: bool = False,
     sources: Sequence[Path] = (),
+    data: Path | None = None,  # the user's own copy, and their body file: where `score` will look for the truth
+    body_file: Path | None = None,
 ) -> Path:
     """Write one scene's training set below `out` and return its folder `out`/NAME, with manifest and test views.
 
@@ -84,7 +94,8 @@ def prepare(
     try:
         with locks.locked(lock, "name another folder with --out"):
             _remove_leftovers(out, scene.capture.name)
-            _write(scene, body, partial, layout, write, progress)
+            origin = {"data": _from(target, data), "body_file": _from(target, body_file)}
+            _write(scene, body, partial, layout, write, progress, origin)
             if target.exists():
                 check_target(out, scene.capture.name, force, sources)  # again: meanwhile anything may have come there
                 os.rename(target, before)
@@ -163,8 +174,19 @@ def _written_there(folder: Path) -> removal.Ours:
     return ours
 
 
+def _from(folder: Path, path: Path | None) -> str | None:
+    """A path as seen from a folder, so that both may move together and neither tells where they lie."""
+    return None if path is None else Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
+
+
 def _write(
-    scene: OccludedScene, body: Body, folder: Path, layout: str, write: TrainingLayout, progress: Progress
+    scene: OccludedScene,
+    body: Body,
+    folder: Path,
+    layout: str,
+    write: TrainingLayout,
+    progress: Progress,
+    origin: dict[str, str | None],
 ) -> None:
     views: list[TrainView] = scene.train  # type: ignore[assignment]
     folder.mkdir(parents=True)
@@ -205,6 +227,7 @@ def _write(
         "scene": capture.name,
         "layout": layout,
         "body": body.content_sha(),
+        **origin,
         "occlusion": {"rule": scene.hiding.occlusion.rule, **scene.hiding.occlusion.record},
         "masks": f"visible person; {UNKNOWN_FOLDER}/ shows what is hidden: person or background, nobody knows",
         "body_poses": "as the data set ships them, "
@@ -240,16 +263,20 @@ def _test_views(scene: OccludedScene, body: Body) -> Iterator[dict[str, Any]]:
     for key in scene.test_keys:
         if key.camera not in lenses:
             lenses[key.camera] = Undistorter(scene.capture.camera(key.camera), scene.protocol.image).camera
-        pose = scene.capture.body_pose(key.frame)
+        camera, pose = lenses[key.camera], scene.capture.body_pose(key.frame)
         Rh, Th = zju_root(pose, body)
         yield {
             "prediction": f"{scene.capture.name}/{key.name}.png",
             "camera": key.camera_id,
             "frame": key.frame,
-            **_camera_words(lenses[key.camera]),
+            **_camera_words(camera),
             **_pose_words(pose),
             "Rh": Rh.tolist(),
             "Th": Th.tolist(),
+            "distortion": [0.0] * 5 if camera.distortion is None else camera.distortion.tolist(),
+            "background": list(scene.protocol.image.background),
+            "pixel_center": PIXEL_CENTER,
+            "conventions": CONVENTIONS,
         }
 
 

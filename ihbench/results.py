@@ -55,6 +55,11 @@ class RunResult:
         omissions = self.record["about"].get("left_out", ())
         return {o["field"]: o["value"] for o in omissions if o["value"] is not None}
 
+    @property
+    def missing_views(self) -> int:
+        """Test views without an image, over which the means do not run: of predictions whose files were missing."""
+        return len(self.record["about"].get("predictions", {}).get("missing", ()))
+
     @cached_property
     def curve(self) -> list[dict[str, Any]]:
         """Quality-time points, see `RunFolder.add_curve_point`; none where there is no file, or a damaged one."""
@@ -147,6 +152,7 @@ def as_json(results: Iterable[RunResult]) -> dict[str, Any]:
                 "status": r.status,
                 "reason": r.record["reason"],
                 "standin": r.record["about"]["standin"],
+                "missing_views": r.missing_views,
                 "scores": {
                     row: {identity: atomic.encode(mean.value) for identity, mean in means.items()}
                     for row, means in r.rows.items()

@@ -11,6 +11,7 @@ from ihbench.capture_digest import capture_digest
 from ihbench.data_source import DataSource
 from ihbench.prediction_doubts import Doubts
 from ihbench.predictions import Predictions, find_alpha, find_predictions
+from ihbench.prepared import Prepared
 from ihbench.progress import Progress
 from ihbench.protocol import Protocol
 from ihbench.recorded_run import RecordedRun, about_scene, recorded
@@ -39,11 +40,14 @@ class ScoreRequest:
     body: Path | None = None  # SMPL model file, for real data
     force: bool = False
     alpha: str | None = None  # what the colours of transparent pixels are, see `ihbench.predictions`
+    prepared: Prepared | None = None  # what was handed out to the code that drew the images
 
 
 def score_scene(request: ScoreRequest, source: DataSource, scene: str, progress: Progress) -> RunResult:
     """Score a folder's images of one scene, or find that it is done. Raises `BadInput` as `find_predictions` does."""
     capture, body = source.open(scene, request.body, progress)
+    if request.prepared is not None:
+        request.prepared.check(capture, body)
     opened = open_scene(capture, request.protocol)
     found = find_predictions(request.folder, scene, opened.test_keys, request.pattern, source.scenes)
     background = request.protocol.image.background
@@ -70,6 +74,7 @@ def score_scene(request: ScoreRequest, source: DataSource, scene: str, progress:
             "missing": list(found.missing),
             "surplus": list(found.surplus),
             "alpha": found.alpha,
+            "views": len(opened.test_keys),
             "notes": found.notes(),
         },
         "changed": [],

@@ -126,4 +126,5 @@ def _sheet_row(scene: OccludedScene, loaded: LoadedView, image: NDArray | None) 
     nearest = min(range(len(frames)), key=lambda k: abs(frames[k] - loaded.key.frame))
     truth = loaded.view.image
     shown = np.zeros_like(truth) if image is None else (_shown(image) / 255).astype(np.float32)
-    return SheetRow(loaded.key.name, scene.train[nearest].image, truth, shown, loaded.view.hidden)
+    label = loaded.key.name + (" (no prediction)" if image is None else "")
+    return SheetRow(label, scene.train[nearest].image, truth, shown, loaded.view.hidden)

@@ -237,6 +237,19 @@ class Undistorter:
         return cut if cut.any() else None
 
 
+def test_view_keys(
+    protocol: Protocol, subject: str, n_frames: int, camera_ids: Sequence[str]
+) -> tuple[TestViewKey, ...]:
+    """The test views of a subject of so many frames before these cameras, in the protocol's order."""
+    return tuple(
+        TestViewKey(camera, frame, camera_ids[camera], group)
+        for camera, frame, group in protocol.test_views(subject, n_frames, len(camera_ids))
+    )
+
+
+test_view_keys.__test__ = False  # type: ignore[attr-defined]  # pytest: not a test
+
+
 def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
     """Apply a protocol to a capture. Pixels are read lazily.
 
@@ -298,10 +311,7 @@ def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
             image, state, lens.camera, capture.body_pose(frame), frame, capture.camera_ids[protocol.train_camera]
         )
 
-    keys = tuple(
-        TestViewKey(camera, frame, capture.camera_ids[camera], group)
-        for camera, frame, group in protocol.test_views(capture.name, capture.n_frames, n_cameras)
-    )
+    keys = test_view_keys(protocol, capture.name, capture.n_frames, capture.camera_ids)
     if not keys:
         raise BadInput(f"{capture.dataset} {capture.name}: {protocol.name} leaves no test view ({n_cameras} cameras)")
 

@@ -12,7 +12,17 @@ def by_label(runs: Sequence[RunResult]) -> dict[str, list[RunResult]]:
     found: dict[str, list[RunResult]] = {}
     for run in runs:
         found.setdefault(label_of(run, runs), []).append(run)
-    return found
+    return {_with_views(label, row): row for label, row in found.items()}
+
+
+def _with_views(label: str, runs: Sequence[RunResult]) -> str:
+    """A row whose means do not run over all test views says so: files of some predictions were missing."""
+    missing = sum(run.missing_views for run in runs)
+    if not missing:
+        return label
+    views = sum(run.record["about"].get("predictions", {}).get("views", 0) for run in runs)
+    told = f"only {views - missing} of {views} views" if views else f"{missing} views missing"
+    return f"{label.removesuffix(')')}, {told})"
 
 
 def label_of(run: RunResult, runs: Sequence[RunResult]) -> str:

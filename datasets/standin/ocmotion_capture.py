@@ -47,6 +47,11 @@ class OcMotionStandIn:
         return cast_names(count)
 
     @staticmethod
+    def camera_ids(subject: str) -> tuple[str, ...]:
+        """The camera of a subject as its capture will name it."""
+        return (ocmotion_w2a.camera_id(subject),)
+
+    @staticmethod
     def ensure(
         root: Path,
         seed: int,

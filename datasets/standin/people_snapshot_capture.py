@@ -48,6 +48,11 @@ class PeopleSnapshotStandIn:
         return cast_names(count)
 
     @staticmethod
+    def camera_ids(subject: str) -> tuple[str, ...]:
+        """The camera of a subject as its capture will name it."""
+        return people_snapshot.SnapshotFolder.camera_ids
+
+    @staticmethod
     def ensure(
         root: Path,
         seed: int,

@@ -40,6 +40,11 @@ class ZjuStandIn:
         return cast_names(count)
 
     @staticmethod
+    def camera_ids(subject: str) -> tuple[str, ...]:
+        """The cameras of a subject as its capture will name them."""
+        return tuple(str(Path(image).parent) for image in zju_mocap.standard_image_paths(N_CAMERAS, 1)[0])
+
+    @staticmethod
     def ensure(
         root: Path,
         seed: int,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,11 +64,13 @@ def main(argv: list[str]) -> int:
     for scene in source.scenes:
         capture, body = source.open(scene, chosen.body, progress)
         opened = open_scene(capture, protocols[0])
-        written[scene] = str(prepare(opened, body, chosen.out, layout, progress, chosen.force, sources))
+        own = (None, None) if source.is_standin else (source.root, own_body(chosen.body))
+        written[scene] = str(prepare(opened, body, chosen.out, layout, progress, chosen.force, sources, *own))
+    score = f"ihbench score --prepared {shlex.quote(str(chosen.out))} --predictions DIR"
     if chosen.json:
-        print(json.dumps({"layout": layout, "protocol": protocols[0].name, "scenes": written}))
+        print(json.dumps({"layout": layout, "protocol": protocols[0].name, "scenes": written, "score": score}))
     else:
         for scene, folder in written.items():
             print(f"{scene}: {folder} ({layout}); the test views to draw are in {folder}/test_views.json")
-        print(f"score what your code draws: ihbench score --protocol {chosen.protocol} --predictions DIR")
+        print(f"score what your code draws: {score}")
     return 0

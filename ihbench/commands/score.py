@@ -9,17 +9,22 @@ from typing import TYPE_CHECKING
 
 from ihbench import registry
 from ihbench.commands.parse import options
-from ihbench.commands.scene_choice import ProtocolChanges
+from ihbench.commands.scene_choice import OcclusionChoice, ProtocolChanges
 from ihbench.errors import BadInput
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from ihbench.data_source import DataSource
+    from ihbench.prepared import Prepared
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScoreOptions(ProtocolChanges):
-    protocol: str
+    protocol: str | None = None
     """A registered protocol (`ihbench list protocols`), or the path of a protocol file of your own (.toml)."""
+    prepared: Path | None = None
+    """In its place: the folder that `ihbench prepare` has written. It says the protocol, its changes and the data."""
     predictions: Path
     """Folder of rendered images, one a test view, in the protocol's size and on its background (or transparent)."""
     pattern: str | None = None
@@ -51,27 +56,20 @@ class ScoreOptions(ProtocolChanges):
 def main(argv: list[str]) -> int:
     chosen = options(ScoreOptions, argv, "score", "Score images that somebody else's code rendered.")
     from ihbench.calibration import ROWS
-    from ihbench.data_source import locate
     from ihbench.progress import Progress
-    from ihbench.protocol import load_protocol
     from ihbench.results import as_json
     from ihbench.score_predictions import ScoreRequest, score_scene
 
-    protocols = chosen.apply(
-        load_protocol(chosen.protocol, chosen.profile or _profile_of(chosen.predictions, chosen.protocol))
-    )
-    if len(protocols) > 1:
-        raise BadInput("--occlusion.fraction: predictions were made under one severity; name that one")
-    protocol = protocols[0]
-    source = locate(protocol, chosen.data, chosen.scene)
+    source, prepared = _source(chosen)
     if chosen.names:
         return _print_names(chosen, source)
     name = chosen.name or chosen.predictions.resolve().name
     if name in ROWS or not name.strip():
         raise BadInput(f"--name {name!r}: is a calibration row's name; choose another with --name")
-    progress = Progress()
+    progress, protocol = Progress(), source.protocol
+    body = chosen.body or (prepared.body_file if prepared is not None else None)
     request = ScoreRequest(
-        protocol, chosen.predictions, name, chosen.pattern, chosen.runs, chosen.body, chosen.force, chosen.alpha
+        protocol, chosen.predictions, name, chosen.pattern, chosen.runs, body, chosen.force, chosen.alpha, prepared
     )
     results = []
     for scene in chosen.scene or _with_folders(source.scenes, chosen.predictions, chosen.pattern):
@@ -96,22 +94,57 @@ def main(argv: list[str]) -> int:
     return 0 if complete and all(result.status == "done" for result in results) else 1
 
 
-def _profile_of(root: Path, protocol: str) -> str:
-    """The profile whose test views have the size of the first image in the folder; paper where there is none."""
-    from ihbench.predictions import image_files, read_image
+def _source(chosen: ScoreOptions) -> tuple[DataSource, Prepared | None]:
+    """What is scored: under which protocol, on which data, and what was prepared of it."""
+    from ihbench.data_source import locate
+    from ihbench.prepared import read_prepared
     from ihbench.protocol import PROFILES, load_protocol
 
-    if not root.is_dir():
-        return PROFILES[0]
-    for path in image_files(root):
-        side = max(read_image(path, (1.0, 1.0, 1.0)).shape[:2])
-        sizes = {name: load_protocol(protocol, name).image.size for name in PROFILES}
-        for name, size in sizes.items():
-            if size == side:
-                return name
-        told = ", ".join(f"{size} px in {name}" for name, size in sizes.items())
-        raise BadInput(f"prediction {path}: is {side} px on its longer side; {protocol} has {told}")
-    return PROFILES[0]
+    if (chosen.protocol is None) == (chosen.prepared is None):
+        raise BadInput("score: give either --protocol, or with --prepared the folder that `ihbench prepare` wrote")
+    if chosen.prepared is not None:
+        changes = (chosen.profile, chosen.image_size, chosen.train_frames, chosen.test_frames)
+        if any(change is not None for change in changes) or chosen.occlusion != OcclusionChoice():
+            raise BadInput(
+                f"--prepared {chosen.prepared}: says profile, size, frames and occlusion itself; leave those out"
+            )
+        prepared = read_prepared(chosen.prepared)
+        return prepared.source(chosen.data, chosen.scene), prepared
+    assert chosen.protocol is not None
+    sources = {}
+    for profile in (chosen.profile,) if chosen.profile else PROFILES:
+        protocols = chosen.apply(load_protocol(chosen.protocol, profile))
+        if len(protocols) > 1:
+            raise BadInput("--occlusion.fraction: predictions were made under one severity; name that one")
+        sources[profile] = locate(protocols[0], chosen.data, chosen.scene)
+    return sources[_profile_of(chosen, sources)], None
+
+
+def _profile_of(chosen: ScoreOptions, sources: Mapping[str, DataSource]) -> str:
+    """The profile whose test views have the names and the size of images in the folder; the first where none has."""
+    first = next(iter(sources))
+    if len(sources) == 1 or not chosen.predictions.is_dir():
+        return first
+    from ihbench.predictions import size_of_most
+
+    sides: dict[str, tuple[int, int]] = {}  # profile -> px of most of its images, and how many there are of its views
+    views: dict[str, int] = {}
+    for profile, source in sources.items():
+        scenes = {scene: source.test_keys(scene) for scene in source.scenes}
+        views[profile] = max(1, sum(map(len, scenes.values())))
+        sides[profile] = size_of_most(chosen.predictions, scenes, chosen.pattern)
+    fitting = [profile for profile, (side, _) in sides.items() if side == sources[profile].protocol.image.size]
+    if fitting:  # of two in one size the one of which fewer views are missing
+        return max(fitting, key=lambda profile: sides[profile][1] / views[profile])
+    side, count = max(sides.values(), key=lambda found: found[1])
+    if not count:
+        return first
+    sizes = {profile: source.protocol.image.size for profile, source in sources.items()}
+    told = ", ".join(f"{size} px in {profile}" for profile, size in sizes.items())
+    raise BadInput(
+        f"predictions {chosen.predictions}: most are {side} px on their longer side; {chosen.protocol} has {told}; "
+        f"say otherwise with --image-size"
+    )
 
 
 def _with_folders(scenes: tuple[str, ...], root: Path, pattern: str | None) -> tuple[str, ...]:
@@ -133,15 +166,10 @@ def _with_folders(scenes: tuple[str, ...], root: Path, pattern: str | None) -> t
 
 def _print_names(chosen: ScoreOptions, source: DataSource) -> int:
     from ihbench.predictions import expected_names
-    from ihbench.progress import Progress
-    from ihbench.views import open_scene
 
-    told = {}
-    for scene in source.scenes:
-        capture, _ = source.open(scene, chosen.body, Progress())
-        told[scene] = expected_names(chosen.pattern, scene, open_scene(capture, source.protocol).test_keys)
+    names = {scene: expected_names(chosen.pattern, scene, source.test_keys(scene)) for scene in source.scenes}
     if chosen.json:
-        print(json.dumps(told))
+        print(json.dumps(names))
     else:
-        print("\n".join(name for names in told.values() for name in names))
+        print("\n".join(name for some in names.values() for name in some))
     return 0

@@ -334,14 +334,14 @@ def _deep(path: Path, name: str, tiles: list[str]) -> NDArray[np.uint16]:
         deep = None
     if odd or deep is None or deep.dtype != np.uint16 or deep.ndim != 3 or deep.shape[2] not in (3, 4):
         raise BadInput(f"{name}: 16 bits a channel of a kind that is not read; save it as 16-bit RGB in PNG")
-    return np.ascontiguousarray(deep[..., [2, 1, 0, 3][: deep.shape[2]]])  # OpenCV has blue first
+    return deep[..., [2, 1, 0, 3][: deep.shape[2]]].astype(np.uint16)  # OpenCV has blue first
 
 
 def _labelled(picture: Picture, path: Path) -> NDArray[np.bool_]:
     """[H, W] of a palette's labels, where label 0 is the background whatever the others are painted in."""
     assert picture.labels is not None
     used, first = np.unique(picture.labels, return_index=True)
-    painted = picture.colour.reshape(-1, picture.colour.shape[2])[first].any(1)  # not black
+    painted = picture.colour.reshape(-1, picture.colour.shape[2])[first].max(1) > 0  # not black
     if painted[0] if used[0] == 0 else painted.any() and not painted.all():
         raise BadInput(
             f"{path}: a palette in which label 0 is not the black background; save the mask as grey, 0 where the "

@@ -96,6 +96,10 @@ def test_the_manifest_lists_every_file_with_its_hash(scene, tmp_path):
     first, view = tests[0], scene.test[0]
     np.testing.assert_allclose(np.array(first["K"])[:2, 2] + 0.5, view.camera.K[:2, 2])
     np.testing.assert_allclose(first["pose"], view.body_pose.pose)
+    assert (first["pixel_center"], first["distortion"], first["background"]) == (0.0, [0.0] * 5, [1.0, 1.0, 1.0])
+    assert (first["width"], first["height"]) == view.image.shape[1::-1]
+    for words in ("metres", "z forward", "radians", "Rh", "sRGB", "add 0.5"):
+        assert words in first["conventions"]
 
 
 def test_what_is_there_is_kept_and_nothing_half_written(scene, tmp_path, monkeypatch):

@@ -1,17 +1,22 @@
 """`ihbench score`: folders of renders that somebody else made."""
 
 import json
+import shlex
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from ihbench import atomic
+from ihbench.data_source import standin_root
 from ihbench.errors import BadInput
 from ihbench.predictions import find_alpha, find_predictions, read_image
+from ihbench.prepared import read_prepared
+from ihbench.progress import Progress
 from ihbench.run_loop import load_scene
-from ihbench.views import TestViewKey
+from ihbench.views import TestViewKey, open_scene
 
 KEYS = [TestViewKey(c, f, f"cam{c}") for c in (1, 2) for f in (0, 30)]
 WHITE = (1.0, 1.0, 1.0)
@@ -65,7 +70,135 @@ def test_missing_and_surplus_files_are_reported_and_the_rest_is_scored(bench, tr
         assert f"missing: {path.relative_to(truths)}" in outcome.err
     assert "surplus: stray.png" in outcome.err
     assert f"2 of {len(files)} absent: no prediction of this view" in outcome.out
-    assert "mine (predictions)" in outcome.out
+    mark = f"mine (predictions, only {len(files) - 2} of {len(files)} views)"
+    assert outcome.out.count(f"| {mark} |") >= 3
+    for words in ([], ["--format", "tex"], ["--format", "html"]):
+        assert mark in bench("report", "--runs", bench.runs, *words).out, words
+    for kind in ("md", "tex", "html", "csv", "json"):
+        assert mark in bench("report", "table1", "--runs", bench.runs, "--format", kind).out, kind
+    (run,) = json.loads(score(bench, truths, "--json").out)["runs"]
+    assert (run["missing_views"], run["predictions"]["views"]) == (2, len(files))
+
+
+def test_strays_of_another_size_and_kind_do_not_stop_scoring(bench, truths):
+    picture(truths / "0 first.png", size=99)
+    (truths / "1 second.png").write_bytes(b"no picture")
+    words = ["score", "--protocol", bench.protocol, "--predictions", truths, "--runs", bench.runs]
+    outcome = bench(*words, "--scene", "standin-1")
+    assert outcome.status == 0, outcome.err
+    assert "quick profile" in outcome.out
+    for name in ("0 first.png", "1 second.png"):
+        assert f"surplus: {name}" in outcome.err
+
+
+def test_an_image_size_needs_no_profile(bench, tmp_path):
+    """Which of the profiles is told by the views that have images."""
+    words = ["score", "--protocol", bench.protocol, "--predictions", tmp_path / "p", "--runs", bench.runs]
+    with bench.in_its_world():
+        scene, _ = load_scene(str(bench.protocol), "standin-1", profile="quick")
+        for key in scene.test_keys:
+            picture(tmp_path / "p" / f"{key.name}.png", size=40)
+    outcome = bench(*words, "--scene", "standin-1", "--image-size", 40)
+    assert outcome.status == 0, outcome.err
+    assert "size=40, quick profile" in outcome.out
+    outcome = bench(*words, "--scene", "standin-1")
+    assert outcome.status == 2
+    assert "most are 40 px on their longer side" in outcome.err
+    assert "64 px in quick; say otherwise with --image-size" in outcome.err
+
+
+def test_names_are_printed_without_making_a_stand_in(bench, tmp_path):
+    words = [
+        "score",
+        "--protocol",
+        bench.protocol,
+        "--predictions",
+        tmp_path / "none",
+        "--names",
+        "--profile",
+        "quick",
+    ]
+    fresh = replace(bench, cache=tmp_path / "cache")
+    outcome = fresh(*words)
+    assert outcome.status == 0, outcome.err
+    assert not fresh.cache.exists()
+    with bench.in_its_world():
+        scene, _ = load_scene(str(bench.protocol), "standin-1", profile="quick")
+    expected = [f"standin-1/{key.name}.png" for key in scene.test_keys]
+    assert [line for line in outcome.out.splitlines() if line.startswith("standin-1/")] == expected
+    assert json.loads(fresh(*words, "--json", "--scene", "standin-1").out) == {"standin-1": expected}
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_what_prepare_prints_scores_what_it_handed_out(bench, tmp_path, monkeypatch, own):
+    """With changes to the protocol, and data of one's own, which are found again from another folder."""
+    changes = ["--protocol", bench.protocol, "--scene", "standin-1", "--profile", "quick", "--image-size", 40]
+    changes += ["--train-frames", "0:500:250", "--occlusion.rule", "side"]
+    if own:
+        with bench.in_its_world():
+            changes += ["--data", standin_root("zju_mocap")]
+    out = tmp_path / "my sets"
+    outcome = bench("prepare", *changes, "--out", out)
+    assert outcome.status == 0, outcome.err
+    words = shlex.split(outcome.out.splitlines()[-1].partition(": ")[2])
+    assert words[:3] == ["ihbench", "score", "--prepared"]
+    manifest = atomic.read_json(out / "standin-1" / "manifest.json")
+    assert str(tmp_path) not in json.dumps(manifest)
+    with bench.in_its_world():
+        prepared = read_prepared(out)
+        scene = open_scene(prepared.source(None, ()).open("standin-1", None, Progress.silent())[0], prepared.protocol)
+        for view, row in zip(scene.test, atomic.read_json(out / "standin-1" / "test_views.json"), strict=True):
+            path = tmp_path / "drawn" / row["prediction"]
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(np.rint(view.image * 255).astype(np.uint8)).save(path)
+            assert view.image.shape[:2] == (row["height"], row["width"])
+    monkeypatch.chdir(tmp_path)
+    words[words.index("DIR")] = "drawn"
+    outcome = bench(*words[1:], "--runs", bench.runs, "--json")
+    assert outcome.status == 0, outcome.err
+    (run,) = json.loads(outcome.out)["runs"]
+    assert run["scores"]["drawn"]["psnr/pooled/range1/full/v1"] == "inf"
+    assert (
+        atomic.read_json(bench.folders()[0] / "run.json")["identity"]["protocol_digest"]
+        == manifest["protocol_digest"]
+    )
+    for more, told in (
+        (["--image-size", 40], "leave those out"),
+        (["--occlusion.rule", "side"], "leave those out"),
+        (["--protocol", bench.protocol], "either --protocol"),
+        (["--scene", "standin-9"], "was not prepared: "),
+    ):
+        outcome = bench(*words[1:], *more)
+        assert (outcome.status, told in outcome.err) == (2, True), outcome.err
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"protocol_digest": "0"}, "another one to this ihbench"),
+        ({"content": {}}, "prepare it again"),
+        ({"scene": 3}, "no manifest of `ihbench prepare`"),
+        ({"body": "0"}, "was prepared from"),
+        (None, "no manifest.json"),
+    ],
+)
+def test_a_manifest_that_does_not_fit_is_refused(bench, tmp_path, change, told):
+    words = [
+        "--protocol",
+        bench.protocol,
+        "--scene",
+        "standin-1",
+        "--profile",
+        "quick",
+        "--train-frames",
+        "0:500:250",
+    ]
+    assert bench("prepare", *words, "--out", tmp_path / "o").status == 0
+    file = tmp_path / "o" / "standin-1" / "manifest.json"
+    atomic.write_json(file, atomic.read_json(file) | change) if change else file.unlink()
+    outcome = bench("score", "--prepared", tmp_path / "o", "--predictions", tmp_path, "--runs", bench.runs)
+    assert outcome.status == 2
+    assert told in outcome.err
 
 
 def test_a_report_shows_a_released_evaluators_numbers_beside_the_headline(bench_with_run):

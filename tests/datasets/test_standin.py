@@ -158,6 +158,7 @@ def test_impossible_wishes(tmp_path, subject, wanted, expected):
 def test_loader_says_it_is_a_stand_in(capture):
     assert (capture.standin, capture.body, capture.name) == ("stand-in v2 seed 0", "procedural", SUBJECT)
     assert (capture.n_frames, len(capture.camera_ids)) == (810, 23)
+    assert capture.camera_ids == ZjuStandIn.camera_ids(SUBJECT)
 
 
 def test_image_that_nobody_asked_for_says_so(capture):

@@ -40,6 +40,16 @@ def ocmotion(tmp_path_factory):
         return OcMotionStandIn.ensure(tmp_path_factory.mktemp("oc") / "root", 0, ["standin-2"], {})
 
 
+def test_cameras_have_the_names_that_a_stand_in_says_before_it_is_made(snapshot, ocmotion):
+    for dataset, root, standin in (
+        (PEOPLE_SNAPSHOT, snapshot, PeopleSnapshotStandIn),
+        (OCMOTION, ocmotion, OcMotionStandIn),
+    ):
+        for subject in dataset(root).subjects():
+            assert dataset(root).open(subject).camera_ids == standin.camera_ids(subject)
+            assert len(standin.camera_ids(subject)) == standin.n_cameras
+
+
 def test_the_snapshot_person_turns_once_and_a_half_before_the_camera(snapshot):
     capture = PEOPLE_SNAPSHOT(snapshot).open("standin-1")
     assert (capture.standin, capture.body, capture.n_frames) == ("stand-in v1 seed 0", "procedural", FRAMES)
