@@ -41,7 +41,8 @@ from ihbench.datasets.people_snapshot import (
     subject_folders,
 )
 from ihbench.errors import BadInput
-from ihbench.files.pictures import encoded, one_line, read_mask, read_rgb, size_of
+from ihbench.files.pictures import encoded, read_mask, read_rgb, size_of
+from ihbench.files.tensors import read_tensors
 from ihbench.paths import user_path
 from ihbench.scene import BodyPose
 
@@ -240,16 +241,10 @@ def read_poses(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], ND
 
     if not path.is_file():
         raise BadInput(f"{path}: no such file; expected beta, body_pose and trans of the split's images")
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # a broken or hostile file can fail in any way
-        raise BadInput(
-            f"{path}: not a file of plain tensors ({one_line(error)}); expected a complete file of torch.save"
-        ) from None
+    content = read_tensors(path)
     sizes = {"body_pose": 72, "trans": 3, "beta": 10}
-    if not isinstance(content, dict) or not sizes.keys() <= content.keys():
-        found = sorted(str(key) for key in content) if isinstance(content, dict) else type(content).__name__
-        raise BadInput(f"{path}: expected a dictionary with beta, body_pose and trans, found {found}")
+    if not sizes.keys() <= content.keys():
+        raise BadInput(f"{path}: expected a dictionary with beta, body_pose and trans, found {sorted(content)[:9]}")
     values = []
     for key, size in sizes.items():
         value = content[key]

@@ -42,6 +42,7 @@ from ihbench.datasets.ocmotion import (
 from ihbench.datasets.pickles import write_pickle
 from ihbench.errors import BadInput
 from ihbench.files.pictures import encoded, one_line
+from ihbench.files.regular import read_text
 from ihbench.paths import user_path
 from ihbench.registry import nearest
 from ihbench.safe_pickle import load_pickle
@@ -193,11 +194,7 @@ def camera_id(name: str) -> str:
 def read_metadata(path: Path) -> dict[str, dict]:
     """metadata.json: frame name -> its entry, not yet looked into. Raises `BadInput`."""
     try:
-        content = json.loads(path.read_bytes().decode("utf-8"), object_pairs_hook=_once)
-    except OSError as error:
-        raise BadInput(
-            f"{path}: cannot be read ({error.strerror}); expected camera and pose of every frame"
-        ) from None
+        content = json.loads(read_text(path, "camera and pose of every frame"), object_pairs_hook=_once)
     except (ValueError, RecursionError) as error:
         detail = "nested too deeply" if isinstance(error, RecursionError) else one_line(error)
         raise BadInput(f"{path}: not valid JSON in UTF-8 ({detail}); copy the file again") from None

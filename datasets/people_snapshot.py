@@ -19,8 +19,6 @@ import hashlib
 import re
 import tempfile
 import threading
-import zipfile
-import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
@@ -38,6 +36,7 @@ from ihbench.datasets.capture_folder import CaptureFolder
 from ihbench.datasets.pickles import write_pickle
 from ihbench.datasets.plausibility import Outline, examine, share_inside
 from ihbench.errors import BadInput
+from ihbench.files import npz
 from ihbench.files.pictures import above_half, one_line
 from ihbench.paths import user_path
 from ihbench.registry import nearest
@@ -348,26 +347,15 @@ def read_npz(path: Path, wanted: dict[str, tuple[int | None, ...] | None]) -> di
     """
     if not path.is_file():
         raise BadInput(f"{path}: no such file; expected {', '.join(name.rstrip('?') for name in wanted)} in it")
-    found = {}
-    try:
-        content = np.load(path, allow_pickle=False)
-        if not isinstance(content, np.lib.npyio.NpzFile):
-            raise BadInput(f"{path}: expected an .npz file, found a single array; copy the file again")
-        with content:
-            for name in wanted:
-                key = name.rstrip("?")
-                if key in content.files:
-                    found[key] = content[key]
-                elif not name.endswith("?"):
-                    names = ", ".join(sorted(content.files)) or "nothing"
-                    raise BadInput(f"{path}: expected {key!r} in it, found {names}")
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
-        raise BadInput(f"{path}: damaged, or not an .npz file of plain arrays ({one_line(error)})") from error
+    found = npz.read_npz(path)
+    for name in wanted:
+        if name.rstrip("?") not in found and not name.endswith("?"):
+            raise BadInput(f"{path}: expected {name!r} in it, found {', '.join(sorted(found)) or 'nothing'}")
     for name, shape in wanted.items():
         array = found.get(name.rstrip("?"))
         if array is not None:
             _check_array(array.dtype, array.shape, shape, f"{path}: expected {name.rstrip('?')!r}")
-    return found
+    return {key: found[key] for key in (name.rstrip("?") for name in wanted) if key in found}
 
 
 def rigid_extrinsic(extrinsic: NDArray, path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

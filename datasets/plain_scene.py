@@ -14,7 +14,6 @@ import hashlib
 import io
 import re
 import tempfile
-import zipfile
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -33,6 +32,7 @@ from ihbench.datasets.capture_folder import CaptureFolder
 from ihbench.datasets.plausibility import Outline, examine
 from ihbench.datasets.standin_mark import STANDIN_FILE
 from ihbench.errors import BadInput
+from ihbench.files.npz import read_npz
 from ihbench.files.pictures import encoded, one_line, read_mask, read_rgb
 from ihbench.paths import user_path
 from ihbench.registry import nearest
@@ -45,7 +45,7 @@ IMAGE_ENDINGS = (".png", ".jpg", ".jpeg")
 CAMERA_KEYS = ("K", "R", "t", "width", "height", "distortion", "pixel_center")
 POSE_KEYS = ("frames", "pose", "betas", "transl", "root")
 ROOTS = ("smpl", "zju")
-LARGEST_ENTRY = 2**28  # bytes of one array in poses.npz: 460 000 frames
+LARGEST_POSES = 2**28  # bytes of one array in poses.npz: 460 000 frames
 JPEG_QUALITY = 95
 SMPL_PELVIS = (0.0, -0.24, 0.03)  # m, about, in SMPL's rest pose; only `check` uses it
 
@@ -398,25 +398,10 @@ def _floats(arrays: dict[str, NDArray], key: str, path: Path) -> Array:
 def _read_npz(path: Path) -> dict[str, NDArray]:
     if not path.is_file():
         raise BadInput(f"{path}: no such file; expected the poses of every frame in it")
-    try:
-        with zipfile.ZipFile(path) as archive:
-            largest = max((entry.file_size for entry in archive.infolist()), default=0)
-        if largest > LARGEST_ENTRY:
-            raise BadInput(f"{path}: an array of {largest} bytes; expected poses, at most {LARGEST_ENTRY} bytes each")
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {key: archive[key] for key in archive.files}
-    except (
-        *(ValueError, OSError, EOFError, KeyError, MemoryError, zipfile.BadZipFile, zlib.error),
-        *(NotImplementedError, RuntimeError, SyntaxError, TypeError),  # what damaged archives and headers raise
-    ) as error:
-        raise BadInput(
-            f"{path}: cannot be read as a .npz of plain arrays ({one_line(error)}); write the file again"
-        ) from None
-    for key, value in arrays.items():
+    arrays = read_npz(path, largest=LARGEST_POSES)
+    for key in arrays:
         if key not in POSE_KEYS:
             raise BadInput(f"{path}: unknown array {key!r}: {nearest(key, list(POSE_KEYS))}")
-        if not isinstance(value, np.ndarray):
-            raise BadInput(f"{path}: {key}: not a numpy array; write the file again with numpy.savez")
     return arrays
 
 

@@ -25,6 +25,7 @@ import numpy as np
 
 from ihbench import removal
 from ihbench.errors import BadInput
+from ihbench.files.regular import read_bytes
 
 NON_FINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 MOST_LINKS = 40  # as the system follows
@@ -281,9 +282,7 @@ def _explained(error: OSError, path: Path) -> Exception:
 
 def _read_text(path: Path) -> str:
     try:
-        return Path(path).read_bytes().decode("utf-8")
-    except OSError as error:
-        raise BadInput(f"{path}: cannot be read ({error.strerror}); expected a JSON file") from error
+        return read_bytes(path, "a JSON file").decode("utf-8")
     except UnicodeDecodeError as error:
         raise BadInput(f"{path}: not UTF-8 text at byte {error.start}; expected a JSON file") from error
 

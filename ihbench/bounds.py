@@ -97,11 +97,11 @@ def check(values: Any, prefix: str = "--") -> None:
         for item in value if isinstance(value, tuple | list) else (value,):
             if isinstance(item, str) and not item and default != "":
                 raise BadInput(f"{flag} '': expected a name, found no text")
-            rules = _rules(hint) or (ANY_NUMBER,)
+            bounds = rules(hint) or (ANY_NUMBER,)
             if isinstance(item, int | float) and not isinstance(item, bool):
-                for rule in rules:
+                for rule in bounds:
                     if not rule.holds(item):
-                        told = " and ".join(str(other) for other in rules)
+                        told = " and ".join(str(other) for other in bounds)
                         raise BadInput(f"{flag} {shown(value)}: expected {told}")
 
 
@@ -125,7 +125,7 @@ def expected(hint: Any) -> str:
     """A type in words."""
     origin, parts = get_origin(hint), get_args(hint)
     if origin is Annotated:
-        return " and ".join([expected(parts[0]), *(str(rule) for rule in _rules(hint))])
+        return " and ".join([expected(parts[0]), *(str(rule) for rule in rules(hint))])
     if origin in (Union, types.UnionType):
         return " or ".join(expected(part) for part in parts)
     if origin is Literal:
@@ -155,9 +155,9 @@ def _flag(name: str, hint: Any) -> str:
     return next((word for word in named if isinstance(word, str)), name.replace("_", "-"))
 
 
-def _rules(hint: Any) -> tuple[Within | MultipleOf, ...]:
+def rules(hint: Any) -> tuple[Within | MultipleOf, ...]:
     """The bounds that stand beside a type, or inside it."""
     own = [word for word in getattr(hint, "__metadata__", ()) if isinstance(word, Within | MultipleOf)]
     origin, parts = get_origin(hint), get_args(hint)
     inside = () if origin is Literal else parts[:1] if origin is Annotated else parts
-    return (*own, *(rule for part in inside for rule in _rules(part)))
+    return (*own, *(rule for part in inside for rule in rules(part)))

@@ -17,11 +17,10 @@ an alpha channel). The colours of half transparent pixels rule out two of these,
 from __future__ import annotations
 
 import hashlib
-import string
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,10 +30,12 @@ from ihbench import registry
 from ihbench.errors import BadInput
 from ihbench.files.pictures import Header, header_of, read_picture
 from ihbench.metrics.images import Color
+from ihbench.name_pattern import NamePattern
+from ihbench.safe_pickle import load_npy
 from ihbench.views import TestViewKey
 
 DEFAULT_PATTERNS = ("{scene}/{camera}/{frame:06d}.png", "{camera}/{frame:06d}.png")
-PLACEHOLDERS = ("scene", "camera", "camera_index", "frame", "index")
+WORDS, NUMBERS = ("scene", "camera"), ("camera_index", "frame", "index")  # placeholders
 SUFFIXES = (".png", ".jpg", ".jpeg", ".npy")
 ALPHAS = ("straight", "premultiplied", "composited")
 ROUNDING = 2 / 255, 16 / 255  # of colours, in files with and without loss
@@ -253,27 +254,15 @@ def _read_picture(path: Path) -> NDArray:
 
 
 def _read_array(path: Path) -> NDArray:
-    try:
-        array = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise BadInput(f"prediction {path}: cannot be read as a plain numpy array ({error})") from error
-    if not isinstance(array, np.ndarray) or (array.dtype != np.uint8 and array.dtype.kind != "f"):
-        kind = getattr(array, "dtype", type(array).__name__)
-        raise BadInput(f"prediction {path}: expected uint8, or floats in [0, 1], got {kind}")
+    array = load_npy(path)
+    if array.dtype != np.uint8 and array.dtype.kind != "f":
+        raise BadInput(f"prediction {path}: expected uint8, or floats in [0, 1], got {array.dtype}")
     return array.astype(np.float32) if array.dtype.itemsize > 8 else array
 
 
 def _expected(pattern: str, scene: str, keys: Sequence[TestViewKey]) -> tuple[str, dict[TestViewKey, str]]:
     """The pattern, and the relative path of every view under it."""
-    try:
-        fields = [name for _, name, _, _ in string.Formatter().parse(pattern) if name is not None]
-    except ValueError as error:
-        raise BadInput(f"--pattern {pattern!r}: {error}") from error
-    for name in fields:
-        if name not in PLACEHOLDERS:
-            raise BadInput(
-                f"--pattern {pattern!r}: no placeholder {{{name}}}; {registry.nearest(name, list(PLACEHOLDERS))}"
-            )
+    parsed = NamePattern.parse(pattern, NUMBERS, WORDS)
     names: dict[TestViewKey, str] = {}
     for index, key in enumerate(keys):
         values: dict[str, Any] = {
@@ -283,13 +272,7 @@ def _expected(pattern: str, scene: str, keys: Sequence[TestViewKey]) -> tuple[st
             "frame": key.frame,
             "index": index,
         }
-        try:
-            names[key] = pattern.format(**values)
-        except (ValueError, IndexError, AttributeError) as error:
-            raise BadInput(f"--pattern {pattern!r}: {error}") from error
-    path = PurePosixPath(next(iter(names.values()), "x"))
-    if path.is_absolute() or ".." in path.parts:
-        raise BadInput(f"--pattern {pattern!r}: leads out of the folder; expected a path below it")
+        names[key] = parsed.name(values)
     if len(set(names.values())) < len({(key.camera, key.frame) for key in names}):  # groups may share a view
         raise BadInput(
             f"--pattern {pattern!r}: names one file for several views; use {{camera}} and {{frame}}, or {{index}}"

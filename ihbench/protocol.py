@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +15,8 @@ from typing import Any
 
 from ihbench import registry
 from ihbench.errors import BadInput
+from ihbench.files.regular import read_toml
+from ihbench.protocol_shape import check_protocol
 
 REGIONS = ("full", "box", "body", "visible", "hidden", "never_seen")
 PROFILES = ("paper", "quick")  # every protocol has both
@@ -247,29 +248,28 @@ def load_protocol(name: str, profile: str = "quick") -> Protocol:
 
 def read_protocol(path: Path, profile: str = "quick") -> Protocol:
     """Read a protocol file. Raises `BadInput` naming the file and the key."""
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise BadInput(f"protocol file {path}: {error}") from error
+    content = read_toml(path, "a protocol file")
     profiles = content.pop("profile", {})
+    if not isinstance(profiles, dict) or not all(isinstance(own, dict) for own in profiles.values()):
+        raise BadInput(f"protocol file {path}: profile: expected the tables {', '.join(PROFILES)}")
     if profile not in profiles:
         raise BadInput(
             f"protocol file {path}: unknown profile {profile!r}: {registry.nearest(profile, list(profiles))}"
         )
     _merge(content, profiles[profile], path)
+    check_protocol(content, f"protocol file {path}")
     try:
         return _build({**content, "occlusion": _settled(content["occlusion"])}, profile)
-    except KeyError as error:
-        raise BadInput(f"protocol file {path}: key {error.args[0]!r} is missing") from error
-    except (TypeError, ValueError) as error:
+    except ValueError as error:
         raise BadInput(f"protocol file {path}: {error}") from error
 
 
 def protocol_from(content: dict[str, Any], profile: str, version: str) -> Protocol:
     """The protocol of a run's record. Raises `BadInput` when the record holds none."""
+    check_protocol(content, "recorded protocol", strict=False)
     try:
         return replace(_build(content, profile), version=version)
-    except (KeyError, TypeError, ValueError) as error:
+    except ValueError as error:
         raise BadInput(f"recorded protocol: {error}") from error
 
 

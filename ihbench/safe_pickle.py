@@ -15,11 +15,12 @@ import math
 import pickle
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import IO, Any, ClassVar
 
 import numpy as np
 
 from ihbench.errors import BadInput
+from ihbench.files.regular import opened
 
 
 class ForeignObject:
@@ -375,7 +376,7 @@ def _check_expansion(value: Any) -> None:
         raise pickle.UnpicklingError("refused: a few values, referred to so often that they stand for too many")
 
 
-def _unpickle(stream: io.BufferedIOBase, path: Path) -> Any:
+def _unpickle(stream: IO[bytes], path: Path) -> Any:
     # in memory, so that a length that goes past the end of the file is cut to it before anything is allocated
     data = io.BytesIO(stream.read())
     try:
@@ -395,7 +396,7 @@ def load_pickle(path: str | Path) -> Any:
     Raises `BadInput` when the file is missing, truncated, not a pickle, or asks for anything but plain data.
     """
     path = Path(path)
-    with _open(path) as stream:
+    with opened(path) as stream:
         return _unpickle(stream, path)
 
 
@@ -406,8 +407,8 @@ def load_npy(path: str | Path) -> np.ndarray:
     Raises `BadInput` as `load_pickle` does, and when the header promises more data than the file holds.
     """
     path = Path(path)
-    with _open(path) as stream:
-        shape, fortran, dtype = _read_npy_header(stream, path)
+    with opened(path) as stream:
+        shape, fortran, dtype = read_npy_header(stream, path)
         if dtype.hasobject:
             value = _unpickle(stream, path)
             if not isinstance(value, np.ndarray) or value.shape != shape:
@@ -424,7 +425,8 @@ def load_npy(path: str | Path) -> np.ndarray:
     return array.reshape(shape, order="F" if fortran else "C").copy(order="K")
 
 
-def _read_npy_header(stream: io.BufferedIOBase, path: Path) -> tuple[tuple[int, ...], bool, np.dtype]:
+def read_npy_header(stream: IO[bytes], path: str | Path) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """(shape, whether in Fortran's order, dtype) of what follows in an .npy file. Raises `BadInput`."""
     readers: dict[tuple[int, int], Callable] = {
         (1, 0): np.lib.format.read_array_header_1_0,
         (2, 0): np.lib.format.read_array_header_2_0,
@@ -440,10 +442,3 @@ def _read_npy_header(stream: io.BufferedIOBase, path: Path) -> tuple[tuple[int, 
     if math.prod(shape) == 0 and math.prod(n for n in shape if n) * max(1, dtype.itemsize) >= 2**63:
         raise BadInput(damaged)  # numpy makes no such array, empty or not
     return shape, fortran, dtype
-
-
-def _open(path: Path) -> io.BufferedReader:
-    try:
-        return path.open("rb")
-    except OSError as error:
-        raise BadInput(f"{path}: cannot be opened ({error.strerror}); check the path") from None

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ihbench.errors import BadInput
+from ihbench.files.regular import read_toml
 from ihbench.metrics.identity import Metric, metric_of
 
 ABSENT = "--"  # as the paper prints it
@@ -134,8 +135,8 @@ def paper_table(name: str, file: Path | None = None) -> PaperTable:
     """
     where = str(file or "paper_tables.toml")
     try:
-        text = (file or files("ihbench.reports") / "paper_tables.toml").read_text(encoding="utf-8")
-        content = tomllib.loads(text)
+        shipped = files("ihbench.reports") / "paper_tables.toml"
+        content = tomllib.loads(shipped.read_text(encoding="utf-8")) if file is None else read_toml(file, "tables")
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise BadInput(f"{where}: cannot be read ({error})") from error
     known = [key for key, value in content.items() if isinstance(value, dict) and "row" in value]

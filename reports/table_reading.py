@@ -10,6 +10,7 @@ from enum import IntFlag
 from pathlib import Path
 
 from ihbench.errors import BadInput
+from ihbench.files.regular import read_text
 from ihbench.reports.metric_names import HeadMetric, head_metric
 
 LARGEST_FILE = 4 * 2**20  # bytes
@@ -142,14 +143,7 @@ def read_tables(path: Path) -> Reading:
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise BadInput(f"{path}: expected a .tex or .md file")
-    try:
-        if path.stat().st_size > LARGEST_FILE:
-            raise BadInput(f"{path}: larger than {LARGEST_FILE // 2**20} MiB, which no table is")
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise BadInput(f"{path}: not UTF-8 text (byte {error.start}); save it as UTF-8") from error
-    except OSError as error:
-        raise BadInput(f"{path}: cannot be read ({error.strerror})") from error
+    text = read_text(path, "a file of tables", LARGEST_FILE)
     grids, notes = reader(text)
     if not grids:
         told = f" ({notes[0][1]}, line {notes[0][0]})" if notes else ""

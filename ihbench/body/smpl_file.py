@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import re
-import zipfile
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from ihbench.body.model import Body
 from ihbench.body.skeleton import PARENTS
 from ihbench.body.uv_obj import read_uv_obj
 from ihbench.errors import BadInput
+from ihbench.files.npz import read_npz
 from ihbench.paths import user_path
 from ihbench.safe_pickle import ForeignObject, load_pickle
 
@@ -97,17 +97,9 @@ def read_arrays(path: Path) -> dict[str, Any]:
 
 
 def _read_npz(path: Path) -> dict[str, Any]:
-    arrays: dict[str, Any] = {}
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            for key in (*REQUIRED, *OPTIONAL):
-                if key in archive.files:
-                    arrays[key] = archive[key]
-            if "name" in archive.files:
-                arrays["name"] = str(archive["name"])
-    except (ValueError, OSError, EOFError, KeyError, MemoryError, zipfile.BadZipFile) as error:
-        reason = " ".join(str(error).split())
-        raise BadInput(f"{path}: cannot be read as a .npz of plain arrays ({reason}); copy the file again") from None
+    arrays: dict[str, Any] = dict(read_npz(path, (*REQUIRED, *OPTIONAL, "name")))
+    if "name" in arrays:
+        arrays["name"] = str(arrays["name"])
     return arrays
 
 

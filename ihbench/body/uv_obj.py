@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.errors import BadInput
+from ihbench.files.regular import LARGEST_TEXT, read_bytes
 
 
 def read_uv_obj(
@@ -35,10 +36,7 @@ def read_uv_obj(
 def _parse(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int32]]:
     uv: list[tuple[float, float]] = []
     corners: list[tuple[int, int]] = []
-    try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError as error:
-        raise BadInput(f"{path}: cannot be opened ({error.strerror}); check the path") from None
+    lines = read_bytes(path, "an OBJ file", LARGEST_TEXT).decode("utf-8", errors="replace").splitlines()
     for number, line in enumerate(lines, 1):
         word, *values = line.split() or [""]
         try:

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from ihbench.bounds import WHOLE, whole
 from ihbench.commands.parse import options
 from ihbench.errors import BadInput
 
@@ -52,6 +53,6 @@ def _pose(name: str, avatar: Any, open_capture: Any) -> Any:
     from ihbench.body.canonical import canonical_pose
     from ihbench.scene import BodyPose
 
-    if name.isdigit():
-        return open_capture().body_pose(int(name))
+    if WHOLE.fullmatch(name):
+        return open_capture().body_pose(whole(name))
     return BodyPose(canonical_pose(name), avatar.betas, np.zeros(3))

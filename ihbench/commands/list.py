@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -11,6 +10,8 @@ import tyro
 
 from ihbench import registry
 from ihbench.commands.parse import options
+from ihbench.errors import BadInput
+from ihbench.files.regular import read_toml
 from ihbench.protocol import load_protocol
 
 KINDS = ("methods", "datasets", "protocols", "reports", "metrics")
@@ -45,8 +46,8 @@ def _methods() -> dict[str, str]:
     about = {}
     for name in registry.names("method"):
         card = registry.package_folder("method", name) / "card.toml"
-        words = tomllib.loads(card.read_text(encoding="utf-8")) if card.is_file() else {}
-        about[name] = words.get("summary", words.get("title", ""))
+        words = read_toml(card, "the method's card") if card.is_file() else {}
+        about[name] = str(words.get("summary", words.get("title", "")))
     return about
 
 
@@ -56,7 +57,14 @@ def _datasets() -> dict[str, str]:
 
 
 def _protocols() -> dict[str, str]:
-    return {(p := load_protocol(name)).name: p.title for name in registry.names("protocol")}
+    about = {}
+    for name in registry.names("protocol"):
+        try:
+            protocol = load_protocol(name)
+            about[protocol.name] = protocol.title
+        except BadInput as error:  # of another package: it must not take the others away
+            about[name] = str(error)
+    return about
 
 
 def _reports() -> dict[str, str]:

@@ -272,7 +272,9 @@ def _other_colours(profile: bytes) -> str | None:
         source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         name = one_line(ImageCms.getProfileDescription(source)) or "of a profile without a name"
         steps = np.linspace(0, 255, 6).round().astype(np.uint8)
-        mode = {"RGB": "RGB", "GRAY": "L"}.get(ImageCms.getOpenProfile(io.BytesIO(profile)).profile.xcolor_space.strip())
+        mode = {"RGB": "RGB", "GRAY": "L"}.get(
+            ImageCms.getOpenProfile(io.BytesIO(profile)).profile.xcolor_space.strip()
+        )
         if mode is None:
             return repr(name)
         colours = np.stack(np.meshgrid(steps, steps, steps), -1).reshape(36, 6, 3)

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.errors import BadInput
+from ihbench.files.tensors import read_tensors
 from ihbench.metrics.images import as_background, as_mask, bounds, checked, peak_of
 from ihbench.weights import FILES, locate
 
@@ -177,16 +178,12 @@ def load(net: str) -> Network | str:
 
 def _read(net: str, path: Path) -> Network | str:
     """The network with its trunk from a torchvision state dict."""
-    import pickle
-
-    import torch
-
     package = _package(net)
     try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
+        state = read_tensors(path)
         names = {name: f"features.{name.split('.', 1)[1]}" for name in package.net.state_dict()}
         package.net.load_state_dict({name: state[source] for name, source in names.items()})
-    except (pickle.UnpicklingError, RuntimeError, KeyError, TypeError, EOFError, OSError, ValueError) as error:
+    except (BadInput, RuntimeError, KeyError, TypeError, ValueError, AttributeError) as error:
         return f"{path}: not the weights of torchvision's {FILES[f'lpips-{net}'].file} ({type(error).__name__})"
     return Network(net, package)
 
@@ -194,15 +191,12 @@ def _read(net: str, path: Path) -> Network | str:
 def _package(net: str) -> Any:
     """`lpips.LPIPS` with the package's own linear heads and a trunk that is yet to be filled."""
     import lpips as package
-    import torch
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the package uses torchvision arguments that are deprecated
         model = package.LPIPS(net=net, version="0.1", pretrained=False, pnet_rand=True, verbose=False)
     heads = Path(package.__file__).parent / "weights" / "v0.1" / f"{net}.pth"
-    missing, unexpected = model.load_state_dict(
-        torch.load(heads, map_location="cpu", weights_only=True), strict=False
-    )
+    missing, unexpected = model.load_state_dict(read_tensors(heads), strict=False)
     if unexpected or any(re.match(r"lin\d", name) for name in missing):
         raise BadInput(f"{heads}: not the linear heads of LPIPS v0.1; install the lpips package again")
     return model.eval()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
@@ -219,12 +218,15 @@ class GaussianAvatar(nn.Module):
     def load(cls, folder: Path, body: Body, device: str = "cpu") -> GaussianAvatar:
         """Read what `save` wrote. Raises `BadInput` for a missing or foreign file or another body."""
         from safetensors import SafetensorError
-        from safetensors.torch import load_file
+        from safetensors.torch import load
+
+        from ihbench.atomic import read_json
+        from ihbench.files.regular import read_bytes
 
         try:
-            words = json.loads((folder / "avatar.json").read_text(encoding="utf-8"))
-            tensors = load_file(folder / "avatar.safetensors")
-        except (OSError, ValueError, SafetensorError) as error:
+            words = read_json(folder / "avatar.json")
+            tensors = load(read_bytes(folder / "avatar.safetensors"))
+        except (BadInput, ValueError, KeyError, SafetensorError) as error:
             raise BadInput(f"{folder}: no readable avatar there: {error}") from error
         kind = words.get("kind") if isinstance(words, dict) else None
         if kind != "inpainthuman":

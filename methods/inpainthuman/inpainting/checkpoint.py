@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from ihbench.errors import BadInput
+from ihbench.files.regular import read_text
 from ihbench.paths import user_path
 
 PICKLES = (".bin", ".ckpt", ".pt", ".pth", ".pkl")
@@ -55,8 +56,8 @@ def find_folder(where: str, option: str) -> Path:
 
 def read_json(path: Path) -> dict[str, Any]:
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        found = json.loads(read_text(path, "a JSON file"))
+    except (BadInput, ValueError, RecursionError) as error:
         raise BadInput(f"{path}: not readable as JSON ({_line(error)}); fetch this file again") from error
     if not isinstance(found, dict):
         raise BadInput(f"{path}: expected a JSON object, found {type(found).__name__}; fetch this file again")

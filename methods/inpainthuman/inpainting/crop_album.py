@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ihbench import atomic, registry
 from ihbench.body import load_body
 from ihbench.errors import BadInput
+from ihbench.files.npz import read_npz
 from ihbench.interruption import end_with_parent
 from ihbench.methods.inpainthuman.inpainting.part_map import part_labels
 from ihbench.methods.inpainthuman.inpainting.person_crop import PADDING, person_crop
@@ -105,11 +106,10 @@ def _write_page(work: tuple[str, int, int, int, Path]) -> None:
 
 def _read_page(path: Path) -> Page:
     try:
-        with np.load(path, allow_pickle=False) as data:
-            arrays = {name: data[name] for name in data.files}
-    except (OSError, ValueError, KeyError) as error:
+        arrays = dict(read_npz(path))
+        words = arrays.pop("phrases")
+        return Page(**arrays, phrases=[tuple(str(word).split("\n")) for word in words])
+    except (BadInput, KeyError, TypeError) as error:
         raise BadInput(
             f"{path}: not a readable page of an album ({error}); remove it and it is made again"
         ) from error
-    words = arrays.pop("phrases")
-    return Page(**arrays, phrases=[tuple(str(word).split("\n")) for word in words])

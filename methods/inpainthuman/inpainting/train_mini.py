@@ -243,6 +243,7 @@ class MiniTrainer:
                 meta = file.metadata()
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             theirs = json.loads(meta["config"])
+            step, seconds = int(meta["step"]), float(meta["seconds"])
             free = ("steps", "save_every")
             differing = [k for k, v in asdict(self.config).items() if k not in free and theirs.get(k) != v]
             if differing:
@@ -254,9 +255,9 @@ class MiniTrainer:
                     keys = ("step", "exp_avg", "exp_avg_sq")
                     if f"adam.{name}.step" in tensors:
                         self.optimizer.state[p] = {key: tensors[f"adam.{name}.{key}"].to(p.device) for key in keys}
-        except (OSError, SafetensorError, KeyError, ValueError, RuntimeError) as error:
+        except (OSError, SafetensorError, KeyError, TypeError, AttributeError, ValueError, RuntimeError) as error:
             raise BadInput(f"{path}: not a readable training state ({error}); remove it to start again") from error
-        self.step, self.seconds = int(meta["step"]), float(meta["seconds"])
+        self.step, self.seconds = step, seconds
 
     def _note(self, row: dict[str, Any]) -> None:
         path = self.folder / CURVE
