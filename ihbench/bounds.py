@@ -125,7 +125,7 @@ def expected(hint: Any) -> str:
     """A type in words."""
     origin, parts = get_origin(hint), get_args(hint)
     if origin is Annotated:
-        return " and ".join([expected(parts[0]), *(str(rule) for rule in rules(hint))])
+        return ", ".join([expected(parts[0]), *(str(rule) for rule in rules(hint))])
     if origin in (Union, types.UnionType):
         return " or ".join(expected(part) for part in parts)
     if origin is Literal:

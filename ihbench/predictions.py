@@ -254,7 +254,10 @@ def _read_picture(path: Path) -> NDArray:
 
 
 def _read_array(path: Path) -> NDArray:
-    array = load_npy(path)
+    try:
+        array = load_npy(path)
+    except BadInput as error:
+        raise BadInput(f"prediction {error}") from error
     if array.dtype != np.uint8 and array.dtype.kind != "f":
         raise BadInput(f"prediction {path}: expected uint8, or floats in [0, 1], got {array.dtype}")
     return array.astype(np.float32) if array.dtype.itemsize > 8 else array

@@ -101,7 +101,7 @@ def test_shares_outside_0_to_1_are_refused(bench):
     for words in (["--occlusion.fraction", "1.2"], ["--occlusion.covers", "-0.1"]):
         outcome = bench.run(*words)
         assert outcome.status == 2
-        assert "expected a share from 0 to 1" in outcome.err
+        assert "expected 0 to 1" in outcome.err
     outcome = bench(
         "score", "--protocol", bench.protocol, "--predictions", bench.cache, "--occlusion.fraction", "0.1", "0.2"
     )

@@ -382,13 +382,13 @@ def test_sixteen_bits_and_arrays_keep_their_precision(tmp_path):
 @pytest.mark.parametrize("name", ["a.png", "a.npy"])
 def test_damaged_files_are_named(tmp_path, content, name):
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(BadInput, match=rf"{name}.*cannot be read"):
+    with pytest.raises(BadInput, match=rf"prediction .*{name}: (cannot be read|not a numpy)"):
         read_image(tmp_path / name, WHITE)
 
 
 def test_a_pickled_array_is_refused(tmp_path):
     np.save(tmp_path / "p.npy", np.array([{"a": 1}], object), allow_pickle=True)
-    with pytest.raises(BadInput, match="plain numpy array"):
+    with pytest.raises(BadInput, match="got object"):
         read_image(tmp_path / "p.npy", WHITE)
 
 

@@ -482,7 +482,7 @@ def test_pickles_and_giants_in_a_pose_file_are_bad_input(copy, monkeypatch):
         archive.writestr("pose.npy", b"\x93NUMPY\x01\x00\x50\x00" + header.ljust(79) + b"\n")
     with pytest.raises(BadInput, match=r"poses\.npz"):
         read_poses(path)
-    monkeypatch.setattr(plain_scene, "LARGEST_ENTRY", 2**20)
+    monkeypatch.setattr(plain_scene, "LARGEST_POSES", 2**20)
     np.savez_compressed(path, pose=np.zeros((2000, 72)))
     with pytest.raises(BadInput, match=r"an array of 1152128 bytes"):
         read_poses(path)

@@ -102,7 +102,7 @@ def damaged(tmp_path, old, new):
         ('status = "reported"', 'status = "seen"', "status 'seen'"),
         ('printed = "second"', 'printed = "2nd"', "printed '2nd'"),
         ('head = "Method"', "", "KeyError 'head'"),
-        ("[digits]", "[digits", "cannot be read"),
+        ("[digits]", "[digits", "not valid TOML"),
     ],
 )
 def test_a_damaged_file_is_refused_in_one_line(tmp_path, old, new, told):
