@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.errors import BadInput
+from ihbench.metrics.aggregate import LARGEST
 from ihbench.metrics.identity import METRICS
 
 NEVER = math.inf  # seconds to a quality that the run did not reach
@@ -75,13 +76,13 @@ class Target:
 def curve_of(points: Iterable[Mapping[str, Any]], identity: str, higher_is_better: bool) -> QualityCurve:
     """The curve of one identity from the rows of a `curve.jsonl`, in any order.
 
-    Points without a number (absent, NaN) and without a positive time are left out; of several at one time the last
-    counts. A run that has no such number gives a curve without points.
+    Points without a number (absent, NaN, finite beyond `aggregate.LARGEST`) and without a positive time are left out;
+    of several at one time the last counts. A run that has no such number gives a curve without points.
     """
     found: dict[float, float] = {}
     for point in points:
         seconds, value = float(point["seconds"]), float(point["scores"].get(identity, math.nan))
-        if math.isfinite(seconds) and seconds > 0 and not math.isnan(value):
+        if math.isfinite(seconds) and seconds > 0 and (abs(value) <= LARGEST or value == math.inf):
             found[seconds] = value
     times = sorted(found)
     return QualityCurve(np.array(times), np.array([found[t] for t in times]), higher_is_better)
@@ -96,16 +97,19 @@ def time_to_quality(curve: QualityCurve, target: float) -> float:
     if not len(curve.values):
         return math.nan
     sign = 1.0 if curve.higher_is_better else -1.0
-    gains = sign * (curve.values - target)
+    with np.errstate(over="ignore"):  # of values that no metric has
+        gains = sign * (curve.values - target)
     reached = np.flatnonzero(gains >= 0)
     if not len(reached):
         return NEVER
     k = int(reached[0])
     if k == 0 or not math.isfinite(gains[k]) or not math.isfinite(gains[k - 1]):
         return float(curve.seconds[k])
-    share = gains[k - 1] / (gains[k - 1] - gains[k])
-    earlier, later = curve.seconds[k - 1], curve.seconds[k]
-    return float(earlier * (later / earlier) ** share)
+    before, after = float(gains[k - 1]), float(gains[k])
+    share = before / (before - after)
+    earlier, later = float(curve.seconds[k - 1]), float(curve.seconds[k])
+    between = earlier * (later / earlier) ** share
+    return min(max(between, earlier), later)
 
 
 def area_under_curve(curve: QualityCurve, start: float, end: float) -> float:
@@ -120,8 +124,10 @@ def area_under_curve(curve: QualityCurve, start: float, end: float) -> float:
         return math.nan
     inner = curve.seconds[(curve.seconds > start) & (curve.seconds < end)]
     times = np.array([start, *inner, end])
-    values, logs = curve.at(times), np.log(times)
-    return float(np.sum((values[1:] + values[:-1]) / 2 * np.diff(logs)) / (logs[-1] - logs[0]))
+    with np.errstate(over="ignore", invalid="ignore"):  # of values that no metric has
+        values, logs = curve.at(times), np.log(times)
+        area = float(np.sum((values[1:] + values[:-1]) / 2 * np.diff(logs)) / (logs[-1] - logs[0]))
+    return area if math.isfinite(area) else math.nan
 
 
 def common_window(curves: Iterable[QualityCurve]) -> tuple[float, float]:
@@ -160,7 +166,7 @@ def error_of(metric: str, value: float) -> float:
     already stays. A metric that nobody told us about is only ordered: its value with the sign turned. NaN stays NaN.
     """
     if metric == "psnr":
-        return 10 ** (-value / 20)
+        return math.inf if value < -6000 else 10 ** (-value / 20)  # beyond 10^300, which no image has
     if metric == "ssim":
         return 1 - value
     return value if metric in METRICS else -value
@@ -178,7 +184,7 @@ def round_targets(curves: Sequence[QualityCurve], count: int = 3) -> list[float]
         return []
     ends = first[len(first) // 2], max(best) if curves[0].higher_is_better else min(best)
     low, high = min(ends), max(ends)
-    if high - low < 1e-9 * max(1.0, abs(high)):
+    if not math.isfinite(high - low) or high - low < 1e-9 * max(1.0, abs(high)):
         return []
     exponent = math.floor(math.log10(high - low))
     for k in range(4):

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 
 from ihbench.metrics.identity import Score
 
+LARGEST = 1e100  # a metric's value beyond it is damage; sums and squares of smaller ones stay finite
+
 
 @dataclass(frozen=True)
 class Mean(Score):
@@ -38,15 +40,20 @@ def mean_over_frames(scores: Iterable[Score]) -> Mean:
 
     Infinite numbers (PSNR of identical images) are left out and counted; if nothing else is there, the mean is inf.
     Absent numbers are left out and counted; `reason` is the commonest reason among them. Nothing but absent numbers
-    give an absent mean. Raises `ValueError` for identities that differ and for no scores at all.
+    give an absent mean. -inf and finite numbers beyond `LARGEST` are no metric's values and count as absent. Raises
+    `ValueError` for identities that differ and for no scores at all.
     """
     scores = list(scores)
     identities = sorted({score.identity for score in scores})
     if len(identities) != 1:
         raise ValueError(f"mean: expected scores of one identity, got {', '.join(identities) or 'no scores'}")
-    finite = [score.value for score in scores if math.isfinite(score.value)]
-    infinite = sum(math.isinf(score.value) for score in scores)
-    reasons = Counter(score.reason for score in scores if score.absent)
+    finite = [score.value for score in scores if abs(score.value) <= LARGEST]
+    infinite = sum(score.value == math.inf for score in scores)
+    reasons = Counter(
+        score.reason if score.absent else f"{score.value:g} is no metric's value"
+        for score in scores
+        if score.absent or (abs(score.value) > LARGEST and score.value != math.inf)
+    )
     reason = reasons.most_common(1)[0][0] if reasons else ""
     if finite:
         value = math.fsum(finite) / len(finite)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -214,3 +215,22 @@ def test_a_target_is_a_metric_maybe_a_region_and_a_number():
     for text in ("25", "psnr", "psnr=", "psnr=nan", "psnr=inf", "speed=3", "=3"):
         with pytest.raises(BadInput, match="expected METRIC=NUMBER"):
             Target.parse(text)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_values_that_no_metric_has_give_finite_or_absent_numbers_quietly(seed):
+    rng = np.random.default_rng(seed)
+    seconds = np.sort(rng.choice([5e-324, 1e-300, 1.0, 2.0, 8.0, 1e300, 1.7e308], 4, replace=False))
+    values = rng.choice([math.inf, -1.7e308, -1e4, 0.0, 20.0, 30.0, 1.7e308], 4)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        one = QualityCurve(seconds, values, bool(seed % 2))
+        time = time_to_quality(one, float(rng.choice([0.0, 25.0, 1.7e308, -1.7e308])))
+        assert time == math.inf or seconds[0] <= time <= seconds[-1]
+        assert not math.isinf(area_under_curve(one, float(seconds[0]), float(seconds[-1])))
+        for target in round_targets([one]):
+            assert math.isfinite(target)
+        for value in values:
+            assert error_of("psnr", float(value)) >= 0
+        points = [{"seconds": s, "scores": {PSNR: v}} for s, v in zip(seconds, values, strict=True)]
+        assert all(abs(v) <= 1e100 or v == math.inf for v in curve_of(points, PSNR, True).values)

@@ -76,3 +76,15 @@ def test_every_frame_is_counted_once_whatever_the_order(values):
     finite = [v for v in values if isinstance(v, float) and math.isfinite(v)]
     if finite:
         assert min(finite) - 1e-9 <= mean.value <= max(finite) + 1e-9
+
+
+@pytest.mark.parametrize("bad", [-math.inf, 1e101, -1.7e308])
+def test_what_no_metric_gives_is_counted_as_absent_with_its_value(bad):
+    mean = mean_over_frames(scores(20.0, bad, 30.0, bad))
+    assert (mean.value, mean.n, mean.infinite, mean.absent_count) == (25.0, 2, 0, 2)
+    assert f"{bad:g} is no metric's value" in mean.note
+    alone = mean_over_frames(scores(bad, bad))
+    assert alone.absent
+    assert f"{bad:g}" in alone.reason
+    both = mean_over_frames(scores(math.inf, -math.inf))
+    assert (both.value, both.infinite, both.absent_count) == (math.inf, 1, 1)
