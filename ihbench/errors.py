@@ -20,6 +20,10 @@ class BadValue(BadInput, ValueError):
     """An argument of a Python call is wrong. Many of them were read from a file, and then it is bad input as well."""
 
 
+class MissingPrerequisite(BadInput, RuntimeError, ImportError):
+    """Something that a Python call needs is not installed, not of a version that will do, or not on this machine."""
+
+
 class Diverged(Exception):
     """A fit stopped because its loss or its parameters stopped being finite. A recorded outcome, not a crash.
 

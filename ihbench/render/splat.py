@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 from ihbench.camera import Camera
+from ihbench.errors import MissingPrerequisite
 
 NEAR = 0.01  # m; a Gaussian whose centre is no farther than this from the camera plane is not drawn
 LOW_PASS = 0.3  # px²; added to every footprint, so that a splat smaller than a pixel cannot fall between the centres
@@ -61,8 +62,8 @@ def render_gaussians(
     zero gradient: one bad Gaussian must not blacken the picture. Whoever trains checks the parameters for finiteness.
 
     Raises ValueError for a camera with lens distortion (undistort the image, use `camera.undistorted()`), for wrong
-    shapes, for negative scales and 8-bit colours, and for an unknown back end; ImportError or RuntimeError where the
-    asked-for back end cannot run here.
+    shapes, for negative scales and 8-bit colours, and for an unknown back end; `MissingPrerequisite`, an ImportError
+    and a RuntimeError, where the asked-for back end cannot run here or draws otherwise than the others.
     """
     background = _check(means, scales, colors, camera, background)
     backend = _choose_backend(backend, means.device)
@@ -187,7 +188,9 @@ def _choose_backend(backend: str, device: torch.device) -> str:
             backend = "reference"
     if backend == "numba":
         if find_spec("numba") is None:
-            raise ImportError("splat back end 'numba' asked for, but numba is not installed: pip install numba")
+            raise MissingPrerequisite(
+                "splat back end 'numba' asked for, but numba is not installed: pip install numba"
+            )
         if device.type != "cpu":
             raise ValueError(f"splat back end 'numba': expected tensors on the CPU, got {device}")
     return backend

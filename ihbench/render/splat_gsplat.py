@@ -1,7 +1,11 @@
-"""The splat renderer on CUDA: the tile rasteriser of the `gsplat` package (>= 1.4) under our own projection.
+"""The splat renderer on CUDA: the tile rasteriser of the `gsplat` package (1.4 and 1.5) under our own projection.
 
 Only its compositing is used, with the centres, the variances and the order of depth of `ihbench.render.splat`, so
-that the footprint is the one of the other back ends.
+that the footprint is the one of the other back ends. What its kernel brings along are the largest and the smallest
+alpha. The largest was 0.999 up to 1.5.3 and is 0.99 in 1.6 (`MAX_ALPHA` in its `Common.h`, changed months before the
+version was): ten times as much shows through an opaque splat. A picture must not depend on which of them is
+installed, so a version of another largest alpha is refused, and both alphas are measured before the first picture,
+whatever the version says.
 
 One difference remains and cannot be switched off: its kernel ends a pixel *before* the splat that would bring the
 transmittance to 1e-4 or less. Such a pixel shows up to 1e-4 / (1 - ALPHA_MAX) = 0.1 of the background. On a body-like
@@ -14,14 +18,21 @@ backward, numba on one thread of that machine 71 and 103 ms.
 from __future__ import annotations
 
 import math
+import re
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from ihbench.render.splat import ALPHA_MIN, Splats
+from ihbench.errors import MissingPrerequisite
+from ihbench.render.splat import ALPHA_MAX, ALPHA_MIN, Splats
 
 TILE = 16  # px
 _LARGEST_RADIUS = 2**30  # px; gsplat takes int32 radii
+LARGEST_ALPHA = {(1, 4): 0.999, (1, 6): 0.99}  # from this version of gsplat on
+OLDEST = (1, 4)
+ALPHA_ERROR = 1e-5  # of a measured alpha, in float32
+PROBE_STEP = 48  # px between the probe's splats, farther than any footprint and tile
 
 
 def composite(
@@ -30,8 +41,18 @@ def composite(
     width: int,
     background: Tensor,  # [C]
 ) -> tuple[Tensor, Tensor]:
-    """Splats -> rgb [H, W, C], alpha [H, W], float32. `Splats` and the conventions: `ihbench.render.splat`."""
+    """Splats -> rgb [H, W, C], alpha [H, W], float32. `Splats` and the conventions: `ihbench.render.splat`.
+
+    Raises `MissingPrerequisite` without CUDA or without a gsplat that draws as this bench does.
+    """
     gsplat = _gsplat(splats.xy.device)
+    check_alphas(gsplat, splats.xy.device)
+    return _composite(gsplat, splats, height, width, background)
+
+
+def _composite(
+    gsplat: Any, splats: Splats, height: int, width: int, background: Tensor, opacities: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     # gsplat batches over cameras: a leading dimension of one
     xy, variance = splats.xy.float()[None], splats.variance.float()[None]
     colors, depth = splats.colors.float()[None], splats.depth[None]
@@ -51,7 +72,7 @@ def composite(
         xy,
         conics,
         colors,
-        torch.ones_like(variance),
+        torch.ones_like(variance) if opacities is None else opacities[None],
         width,
         height,
         TILE,
@@ -60,6 +81,62 @@ def composite(
         backgrounds=background[None].contiguous(),
     )
     return rgb[0], alpha[0, ..., 0]
+
+
+_measured: set[tuple[Any, str]] = set()  # packages and devices whose alphas are those of this bench
+
+
+def check_alphas(gsplat: Any, device: torch.device) -> None:
+    """Raise `MissingPrerequisite` unless this gsplat draws with `ALPHA_MAX` and `ALPHA_MIN`: by its version, and by
+    three splats that it draws once a process."""
+    version = str(gsplat.__version__)
+    expected = largest_alpha(version)
+    if expected is not None and expected != ALPHA_MAX:
+        raise MissingPrerequisite(_other_alpha(version, f"a largest alpha of {expected:g}"))
+    if (gsplat, str(device)) in _measured:
+        return
+    # pixel centres: alpha there is the opacity, between the two bounds
+    opacities = torch.tensor([1.0, 1.05 * ALPHA_MIN, 0.95 * ALPHA_MIN], device=device)
+    at = torch.arange(3, device=device, dtype=torch.float64) * PROBE_STEP + 0.5
+    splats = Splats(
+        torch.stack([at, torch.full_like(at, 0.5)], 1),
+        torch.full_like(at, 0.3),
+        torch.ones(3, device=device),
+        torch.ones(3, 1, device=device),
+    )
+    with torch.no_grad():
+        width = 2 * PROBE_STEP + 1
+        _, alpha = _composite(gsplat, splats, 1, width, torch.zeros(1, device=device), opacities)
+    found = alpha[0, ::PROBE_STEP].tolist()
+    for value, wanted in zip(found, (ALPHA_MAX, 1.05 * ALPHA_MIN, 0.0), strict=True):
+        if abs(value - wanted) > ALPHA_ERROR:
+            raise MissingPrerequisite(_other_alpha(version, f"an alpha of {value:.4g} where {wanted:.4g} belongs"))
+    _measured.add((gsplat, str(device)))
+
+
+def largest_alpha(version: str) -> float | None:
+    """The largest alpha of a gsplat of this version, pre-releases and local builds included; None for one that says
+    nothing. Raises `MissingPrerequisite` for one older than `OLDEST`."""
+    parts = _major_minor(version)
+    if parts is None:
+        return None
+    if parts < OLDEST:
+        raise MissingPrerequisite(
+            f"splat back end 'gsplat': version {version} is too old: pip install 'gsplat>=1.4,<1.6'"
+        )
+    return next(alpha for since, alpha in sorted(LARGEST_ALPHA.items(), reverse=True) if parts >= since)
+
+
+def _other_alpha(version: str, what: str) -> str:
+    return (
+        f"splat back end 'gsplat': version {version} draws with {what}, this bench with {ALPHA_MAX:g}: pictures "
+        f"would be others than on a CPU; pip install 'gsplat>=1.4,<1.6'"
+    )
+
+
+def _major_minor(version: str) -> tuple[int, int] | None:
+    parts = re.match(r"v?(\d+)\.(\d+)", version)
+    return None if parts is None else (int(parts[1]), int(parts[2]))
 
 
 def _radii(xy: Tensor, variance: Tensor, height: int, width: int) -> Tensor:
@@ -72,18 +149,19 @@ def _radii(xy: Tensor, variance: Tensor, height: int, width: int) -> Tensor:
 
 def _takes_two_radii(version: str) -> bool:
     """gsplat 1.5 takes one radius per axis, 1.4 one per splat."""
-    major, minor = (int(part) for part in version.split(".")[:2])
-    return (major, minor) >= (1, 5)
+    return (_major_minor(version) or (1, 5)) >= (1, 5)
 
 
-def _gsplat(device: torch.device):
+def _gsplat(device: torch.device) -> Any:
     """The package, or one clear line."""
     if device.type != "cuda":
-        raise RuntimeError(
+        raise MissingPrerequisite(
             f"splat back end 'gsplat': expected CUDA tensors, got {device}; move them or use backend='numba'"
         )
     try:
         import gsplat
     except ImportError as error:
-        raise ImportError("splat back end 'gsplat': the package is missing: pip install 'ihbench[cuda]'") from error
+        raise MissingPrerequisite(
+            "splat back end 'gsplat': the package is missing: pip install 'ihbench[cuda]'"
+        ) from error
     return gsplat

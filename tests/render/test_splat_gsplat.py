@@ -4,11 +4,13 @@ The shapes and dtypes it insists on are those that gsplat 1.4.0 and 1.5.3 assert
 """
 
 import builtins
+import re
 from types import SimpleNamespace
 
 import pytest
 import torch
 
+from ihbench.errors import BadInput
 from ihbench.render import splat_gsplat
 from ihbench.render.splat import ALPHA_MAX, ALPHA_MIN, render_gaussians
 from tests.render.test_splat import front_camera, random_gaussians
@@ -17,9 +19,10 @@ from tests.render.test_splat import front_camera, random_gaussians
 class FakeGsplat:
     """The three functions, in plain torch, one camera, not packed."""
 
-    def __init__(self, version, two_radii):
+    def __init__(self, version, two_radii, alpha_max=ALPHA_MAX, alpha_min=ALPHA_MIN):
         self.__version__ = version
         self.two_radii = two_radii
+        self.alpha_max, self.alpha_min = alpha_max, alpha_min
         self.pairs = -1
 
     def isect_tiles(
@@ -94,8 +97,8 @@ class FakeGsplat:
                 c = conics[0, ids]
                 sigma = 0.5 * (c[:, 0] * delta[:, 0] ** 2 + c[:, 2] * delta[:, 1] ** 2)
                 sigma = sigma + c[:, 1] * delta[:, 0] * delta[:, 1]
-                alpha = (opacities[0, ids] * torch.exp(-sigma)).clamp(max=ALPHA_MAX)
-                alpha = torch.where(alpha < ALPHA_MIN, 0.0, alpha)
+                alpha = (opacities[0, ids] * torch.exp(-sigma)).clamp(max=self.alpha_max)
+                alpha = torch.where(alpha < self.alpha_min, 0.0, alpha)
                 behind = torch.cumprod(1 - alpha, 0)
                 before = torch.cat([torch.ones(1), behind])[:-1] if len(ids) else behind
                 left = behind[-1] if len(ids) else torch.tensor(1.0)
@@ -105,7 +108,7 @@ class FakeGsplat:
         return torch.stack(rgb_rows).reshape(*shape, channels), torch.stack(alpha_rows).reshape(*shape, 1)
 
 
-@pytest.fixture(params=[("1.4.0", False), ("1.5.3", True), ("1.10.0", True)], ids=lambda p: p[0])
+@pytest.fixture(params=[("1.4.0", False), ("1.5.3", True), ("1.5.10", True)], ids=lambda p: p[0])
 def fake(request, monkeypatch):
     package = FakeGsplat(*request.param)
     monkeypatch.setattr(splat_gsplat, "_gsplat", lambda device: package)
@@ -164,3 +167,40 @@ def test_without_cuda_or_gsplat_one_clear_line(monkeypatch):
     monkeypatch.setattr(builtins, "__import__", without_gsplat)
     with pytest.raises(ImportError, match=r"pip install 'ihbench\[cuda\]'"):
         splat_gsplat._gsplat(SimpleNamespace(type="cuda"))
+
+
+ONE = torch.tensor([[0.0, 0, 2]]), torch.tensor([0.1]), torch.ones(1, 3) / 2
+
+
+@pytest.mark.parametrize("version", ["1.6.0", "1.6rc1", "1.6.0.dev3+pt24cu121", "v1.7.0", "2.0", "1.10.0"])
+@pytest.mark.parametrize("alpha_max", [ALPHA_MAX, 0.99])
+def test_a_gsplat_of_another_largest_alpha_is_refused_by_version(monkeypatch, version, alpha_max):
+    monkeypatch.setattr(splat_gsplat, "_gsplat", lambda device: FakeGsplat(version, True, alpha_max))
+    with pytest.raises(BadInput, match=rf"{re.escape(version)} draws with a largest alpha of 0.99.*gsplat>=1.4,<1.6"):
+        render_gaussians(*ONE, front_camera(), backend="gsplat")
+
+
+@pytest.mark.parametrize("version", ["1.5.3", "1.5.3+pt24cu124", "1.4.0", "unknown", ""])
+@pytest.mark.parametrize(
+    ("alphas", "word"),
+    [((0.99, ALPHA_MIN), "an alpha of 0.99 where 0.999"), ((ALPHA_MAX, 1 / 200), "an alpha of 0 where 0.004118"),
+     ((ALPHA_MAX, 1e-4), "an alpha of 0.003725 where 0 belongs"), ((1.0, ALPHA_MIN), "an alpha of 1 where")],
+)  # fmt: skip
+def test_alphas_that_the_version_does_not_tell_are_measured(monkeypatch, version, alphas, word):
+    two_radii = version != "1.4.0"
+    monkeypatch.setattr(splat_gsplat, "_gsplat", lambda device: FakeGsplat(version, two_radii, *alphas))
+    with pytest.raises(BadInput, match=word):
+        render_gaussians(*ONE, front_camera(), backend="gsplat")
+    fake = FakeGsplat(version, two_radii)
+    monkeypatch.setattr(splat_gsplat, "_gsplat", lambda device: fake)
+    rgb, alpha = render_gaussians(*ONE, front_camera(), backend="gsplat")
+    torch.testing.assert_close(rgb, render_gaussians(*ONE, front_camera(), backend="reference")[0])
+    monkeypatch.setattr(fake, "alpha_max", 0.5)  # measured once a process: training must not pay for it
+    assert render_gaussians(*ONE, front_camera(), backend="gsplat")[1].max() < alpha.max()
+
+
+@pytest.mark.parametrize("version", ["1.3.0", "0.1.11"])
+def test_an_older_gsplat_is_refused(monkeypatch, version):
+    monkeypatch.setattr(splat_gsplat, "_gsplat", lambda device: FakeGsplat(version, False))
+    with pytest.raises(BadInput, match="too old"):
+        render_gaussians(*ONE, front_camera(), backend="gsplat")
