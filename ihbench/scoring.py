@@ -117,7 +117,7 @@ class Scorer:
         if image is not None:
             image = as_prediction(image, loaded)
             if loaded.view.hidden is not None:
-                image = _with_truth(image, loaded.view)
+                image = _with_truth(image, loaded.view.image, loaded.view.hidden)
         for preset in self.presets:
             if image is None:
                 scores |= preset.absent(protocol.regions, background, "no prediction of this view")
@@ -188,11 +188,11 @@ class Scorer:
                 pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _with_truth(image: NDArray, view: TestView) -> NDArray:
+def _with_truth(image: NDArray, truth: NDArray[np.float32], hidden: NDArray[np.bool_]) -> NDArray:
     """A prediction [H, W, 3] with the truth's paint where the truth is not known: whoever drew the person there and
     whoever left them out are told the same."""
-    paint = rounded(view.image) if image.dtype == np.uint8 else view.image.astype(image.dtype)
-    return np.where(view.hidden[..., None], paint, image)
+    paint = rounded(truth) if image.dtype == np.uint8 else truth.astype(image.dtype)
+    return np.where(hidden[..., None], paint, image)
 
 
 def as_prediction(image: Any, loaded: LoadedView) -> NDArray:

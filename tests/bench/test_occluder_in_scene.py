@@ -173,9 +173,11 @@ def test_what_is_hidden_of_a_test_view_is_in_no_region_and_moves_no_number():
     protocol = natural("zju_occ", 96)
     scorer = Scorer.build(open_scene(capture, protocol), the_body(), PRESETS)
     loaded = scorer.load(0)
-    hidden, body = loaded.view.hidden, rasterized(loaded.view.camera, loaded.view.body_pose).mask
+    hidden = loaded.view.hidden
+    assert hidden is not None
+    body = rasterized(loaded.view.camera, loaded.view.body_pose).mask
     assert (hidden & body).sum() > 0.05 * body.sum()
-    assert not any((region & hidden).any() for region in loaded.regions.values())
+    assert not any((np.asarray(region) & hidden).any() for region in loaded.regions.values())
     assert not (body & ~hidden & ~loaded.view.silhouette).any()  # else it would be background that is person
     drawn = np.full_like(loaded.view.image, 0.3)
     other = np.where(hidden[..., None], np.nan, drawn)
@@ -205,11 +207,11 @@ def test_the_occluder_covers_every_frame_and_the_protocol_says_so(curtain):
         assert standing.with_occlusion(covers=1.0) is standing
         back = standing.with_occlusion("strip-generic", 0.5, 0.8)
         assert back.digest == protocol.digest
-        for wrong in ({"covers": 0.8}, {"covers": 0.0}, {"fraction": 0.5}):
+        for fraction, covers in ((None, 0.8), (None, 0.0), (0.5, None)):
             with pytest.raises(BadInput, match="leave it out"):
-                protocol.with_occlusion(rule, **wrong)
+                protocol.with_occlusion(rule, fraction, covers)
             with pytest.raises(BadInput, match="leave it out"):
-                standing.with_occlusion(**wrong)
+                standing.with_occlusion(None, fraction, covers)
     released = load_protocol("ocmotion_visible")
     assert released.occlusion.in_scene
     assert released.name == "ocmotion_visible@2"
