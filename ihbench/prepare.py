@@ -257,12 +257,12 @@ def _write(
 def _test_views(scene: OccludedScene, body: Body) -> Iterator[dict[str, Any]]:
     """The cameras and poses to draw, and the file names under which `ihbench score` looks for the drawings."""
     from ihbench.body import zju_root
-    from ihbench.views import Undistorter
+    from ihbench.views import straight_camera
 
     lenses: dict[int, Camera] = {}
     for key in scene.test_keys:
         if key.camera not in lenses:
-            lenses[key.camera] = Undistorter(scene.capture.camera(key.camera), scene.protocol.image).camera
+            lenses[key.camera] = straight_camera(scene.capture.camera(key.camera), scene.protocol.image)
         camera, pose = lenses[key.camera], scene.capture.body_pose(key.frame)
         Rh, Th = zju_root(pose, body)
         yield {

@@ -74,21 +74,27 @@ class SurfaceMap:
             found[name] = region if view.hidden is None else region & ~view.hidden
         return found
 
+    def labels_in(self, vertices: NDArray[np.float64], camera: Camera) -> NDArray[np.uint8]:
+        """[H, W] label of the posed surface (vertices [V, 3] m, world) in every pixel, 0 where the body is not."""
+        size = len(self.labels)
+        raster = rasterize(camera.project(vertices), self.body.faces, camera.height, camera.width)
+        labels = np.zeros((camera.height, camera.width), np.uint8)
+        hit = raster.mask
+        uv = raster.interpolate(self.body.uv, self.body.uv_faces)[hit]
+        col = np.clip((uv[:, 0] * size).astype(int), 0, size - 1)
+        row = np.clip(((1 - uv[:, 1]) * size).astype(int), 0, size - 1)
+        labels[hit] = self.labels[row, col]
+        return labels
+
     def _surface_labels(self, vertices: NDArray[np.float64], view: TestView) -> NDArray[np.uint8]:
         """[H, W] label of every silhouette pixel, 0 elsewhere. Garments stand off the body, so silhouette pixels
         beyond the projected body take the label of the nearest body pixel."""
         from scipy.ndimage import distance_transform_edt
 
-        camera, size = view.camera, len(self.labels)
-        raster = rasterize(camera.project(vertices), self.body.faces, camera.height, camera.width)
-        labels = np.zeros((camera.height, camera.width), np.uint8)
-        hit = raster.mask
+        labels = self.labels_in(vertices, view.camera)
+        hit = labels > 0
         if not hit.any():
             return np.where(view.silhouette, NEVER_SEEN, 0).astype(np.uint8)
-        uv = raster.interpolate(self.body.uv, self.body.uv_faces)[hit]
-        col = np.clip((uv[:, 0] * size).astype(int), 0, size - 1)
-        row = np.clip(((1 - uv[:, 1]) * size).astype(int), 0, size - 1)
-        labels[hit] = self.labels[row, col]
         # the search stays in the rectangle that holds both the silhouette and the projected body
         area = bounds(hit | view.silhouette)
         assert area is not None

@@ -10,6 +10,7 @@ import hashlib
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from ihbench import machine, registry
 from ihbench.capture_digest import capture_digest
 from ihbench.config_fields import flat, with_fields
+from ihbench.curve_views import curve_views
 from ihbench.data_source import DataSource, locate
 from ihbench.errors import BadInput
 from ihbench.metrics import mean_over_frames
@@ -29,7 +31,7 @@ from ihbench.recorded_run import RecordedRun, about_scene, recorded
 from ihbench.reopen import reopen_body, reopen_capture
 from ihbench.results import RunResult
 from ihbench.scene import Avatar, Capture, Method, TestView, TrainingSet
-from ihbench.score_stage import ScoreStage, spread
+from ihbench.score_stage import ScoreStage
 from ihbench.scoring import Scorer
 from ihbench.source_digest import code_of, shipped_digest
 from ihbench.store import RunFolder, RunIdentity
@@ -239,12 +241,17 @@ class _Run(RecordedRun):
     def _curve_point(self, step: int, seconds: float, avatar: Avatar) -> None:
         """Score a checkpoint on a few fixed test views. The fit clock stands still meanwhile."""
         assert self.scorer is not None
-        own = sum(not key.group for key in self.scorer.scene.test_keys)  # they come first
-        chosen = spread(own, CURVE_VIEWS)
+        chosen, keys = self._curve_views, self.scorer.scene.test_keys
         rows = {"now": lambda loaded: self._render(avatar, loaded.view)}
         views = [scored.scores["now"].scores for scored in self.scorer.scored(rows, chosen, slow=False)]
         scores = {i: mean_over_frames([view[i] for view in views]).value for i in views[0]}
-        self.folder.add_curve_point({"step": step, "seconds": seconds, "views": len(chosen), "scores": scores})
+        where = {"views": len(chosen), "of": sum(not key.group for key in keys), "on": [keys[k].name for k in chosen]}
+        self.folder.add_curve_point({"step": step, "seconds": seconds, **where, "scores": scores})
+
+    @cached_property
+    def _curve_views(self) -> list[int]:
+        assert self.scorer is not None
+        return curve_views(self.scorer, CURVE_VIEWS)
 
 
 def _planned(request: RunRequest, measure: SceneMeasure) -> tuple[Any, list[Omission], list[str]]:

@@ -131,6 +131,13 @@ class OccludedScene:
     test: LazyViews[TestView]
 
 
+def straight_camera(camera: Camera, rule: ImageRule) -> Camera:
+    """The camera of the protocol's images of this camera."""
+    if rule.undistort and camera.distortion is not None and camera.distortion.any():
+        camera = camera.undistorted()
+    return camera.scaled(*rule.extent(camera.width, camera.height))
+
+
 class Undistorter:
     """Lens undistortion and resampling of one camera's images, with its pixel maps computed once."""
 
@@ -156,9 +163,8 @@ class Undistorter:
                 (camera.width, camera.height),
                 cv2.CV_16SC2,
             )
-            camera = camera.undistorted()
         self.size = rule.extent(camera.width, camera.height)
-        self.camera = camera.scaled(*self.size)
+        self.camera = straight_camera(camera, rule)
         # [h, w] pixels whose ray left the original image (a pincushion lens reaches out of it); None for none
         self.unphotographed: NDArray[np.bool_] | None = None
         if self._maps is not None:

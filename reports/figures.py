@@ -25,6 +25,7 @@ from ihbench.reports.run_time import (
     curves,
     same_protocol,
     seconds_interval,
+    standing,
     work_points,
 )
 from ihbench.results import RunResult
@@ -232,6 +233,7 @@ def _quality_time(
     regions = [r for r in regions if any(region == r for _, region in panels)]
     if not panels:
         return []
+    views = standing(run for c in configs for run in c.runs)
     drawn, axes = diagram.figure(len(regions), len(metrics), width=4.2, height=3.8)
     rows: list[dict[str, Any]] = []
     handles: dict[str, Any] = {}
@@ -245,14 +247,14 @@ def _quality_time(
         rows += shown
         times, errors = [row["seconds"] for row in shown], [row["error"] for row in shown]
         diagram.logarithmic(panel, times, errors)
-        _name_axes(panel, identity, "seconds of fitting")
+        _name_axes(panel, identity, "seconds of fitting", f"\non {views} test views")
     if not handles:
         return []
     _finish(drawn, handles, f"Quality against time: {title}", about)
     crowd = f"; dots: checkpoints of single runs; shaded: {LEVEL:.0%} interval" if len(configs) <= CROWD else ""
     caption = (
-        f"Quality against the fit clock, {title} ({about}), by region. Lines: mean over scenes of the checkpoints of "
-        f"their runs{crowd}. Scoring does not count as time."
+        f"Quality against the fit clock, {title} ({about}), by region, on {views} test views. Lines: mean over "
+        f"scenes of the checkpoints of their runs{crowd}. Scoring does not count as time."
     )
     return [(diagram.save(drawn, path, rows), caption)]
 
@@ -266,9 +268,11 @@ def _curve_panel(
     for k, c in enumerate(configs):
         colour, mark = diagram.COLOURS[k % len(diagram.COLOURS)], diagram.MARKS[k % len(diagram.MARKS)]
         found = curves(c, identity)
+        by_run = {(run.scene, run.identity["seed"]): [run] for run in c.runs}
         points = [
             {"kind": "checkpoint", "configuration": c.label, "scene": scene, "seed": seed, "identity": identity,
-             "seconds": float(t), "value": float(v), "error": error_of(metric, float(v))}
+             "seconds": float(t), "value": float(v), "test_views": standing(by_run[scene, seed]),
+             "error": error_of(metric, float(v))}
             for (scene, seed), curve in found.items()
             for t, v in zip(curve.seconds, curve.values, strict=True)
             if error_of(metric, float(v)) > 0
@@ -290,7 +294,8 @@ def _curve_panel(
             rows += points
         rows += [
             {"kind": "mean", "configuration": c.label, "identity": identity, "seconds": t, "value": value,
-             "error": error_of(metric, value), "value_low": low_end, "value_high": high_end}
+             "test_views": standing(c.runs), "error": error_of(metric, value), "value_low": low_end,
+             "value_high": high_end}
             for t, value, low_end, high_end in mean
         ]  # fmt: skip
     return rows
@@ -317,11 +322,11 @@ def _mean_curve(found: dict[tuple[str, int], QualityCurve]) -> list[tuple[float,
 # ------------------------------------------------------------------------------------------------------------- shared
 
 
-def _name_axes(panel: Axes, identity: str, below: str) -> None:
-    """Name the axes; a PSNR's error gets its decibels on the right."""
+def _name_axes(panel: Axes, identity: str, below: str, where: str = "") -> None:
+    """Name the axes; `where` says on which views. A PSNR's error gets its decibels on the right."""
     metric = Identity.parse(identity).metric
     panel.set_xlabel(below)
-    panel.set_ylabel(f"{AXES.get(metric, metric)}  (less is better)")
+    panel.set_ylabel(f"{AXES.get(metric, metric)}  (less is better){where}")
     panel.set_title(Identity.parse(identity).region)
     if metric == "psnr":
         beside = panel.twinx()

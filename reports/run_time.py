@@ -4,9 +4,11 @@ and area under the quality-time curve."""
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from statistics import median
+
+import numpy as np
 
 from ihbench.metrics import Identity
 from ihbench.metrics.identity import metric_of
@@ -113,6 +115,30 @@ def times_to(target: float, found: Mapping[tuple[str, int], QualityCurve], scene
     return {scene: median(times) for scene, times in by_scene.items()}
 
 
+def standing(runs: Iterable[RunResult]) -> str:
+    """On how many of how many test views the curves of these runs stand: "6 of 55", "all 4"."""
+    found: set[tuple[int, int]] = set()
+    for run in runs:
+        tested = max((mean.total for mean in run.rows.get(run.method, {}).values()), default=0)
+        for point in run.curve:
+            views, of = (n if isinstance(n, int) else 0 for n in (point.get("views"), point.get("of")))
+            found.add((views, of or tested))
+    texts = [
+        f"all {of}" if 0 < views == of else f"{views or 'some'} of {of or 'more'}" for views, of in sorted(found)
+    ]
+    return " or ".join(texts)
+
+
+def in_table(configuration: Configuration, identity: str, scenes: Sequence[str]) -> dict[str, float]:
+    """Scene -> what the table has of these runs, over all test views: the mean over seeds, NaN where absent."""
+    by_scene: dict[str, list[float]] = {}
+    for run in configuration.runs:
+        mean = run.rows.get(run.method, {}).get(identity)
+        if run.scene in scenes:
+            by_scene.setdefault(run.scene, []).append(math.nan if mean is None else mean.value)
+    return {scene: sum(values) / len(values) for scene, values in by_scene.items()}
+
+
 # ---------------------------------------------------------------------------------------------------------- sections
 
 
@@ -210,7 +236,12 @@ def _quality_times(configs: Sequence[Configuration], headline: str, targets: Seq
         return [Paragraph("No run has a quality-time curve (curve.jsonl).")]
     without = [run.folder.name for c in configs for run in c.runs if not run.curve]
     notes: list[Words] = [f"without a readable curve.jsonl: {', '.join(without)}"] if without else []
-    return [*_time_table(configs, known, headline, targets), *_area_table(configs, known), *bullets(notes)]
+    return [
+        *_time_table(configs, known, headline, targets),
+        *_area_table(configs, known),
+        *_end_table(configs, known, headline),
+        *bullets(notes),
+    ]
 
 
 def _time_table(
@@ -230,26 +261,24 @@ def _time_table(
             missing.append(f"no curve of {target.metric} in {region}: scored at the end of a run only, or not at all")
     if not columns or not scenes:
         return bullets(missing)
-    rows = []
-    for c in configs:
-        cells = [_time_cell(curves(c, i), target.value, i, scenes) for target, i in columns]
-        rows.append((c.label, *cells))
+    rows = [(c.label, *(_time_cell(c, target.value, i, scenes) for target, i in columns)) for c in configs]
     head = ["method"]
     for target, i in columns:
         metric, sign = metric_of(i), "≥" if metric_of(i).higher_is_better else "≤"
         where = "" if Identity.parse(i).region == headline else f" {Identity.parse(i).region}"
         unit = " dB" if metric.unit == "dB" else ""
         head.append(f"{metric.title}{where} {sign} {target.value * metric.scale:g}{unit}")
-    views = sorted({str(p.get("views", "?")) for c in configs for run in c.runs for p in run.curve})
+    views = standing(run for c in configs for run in c.runs)
     told = (
-        f"Seconds of fitting until the quality was first reached on {' or '.join(views)} fixed test views (region "
-        f"{headline} where none is named): median over scenes of the median over seeds, in brackets the order "
+        f"Seconds of fitting until the quality was first reached on {views} test views (region "
+        f"{headline} where none is named); where the table over all views says otherwise, the cell says so. Median "
+        "over scenes of the median over seeds, in brackets the order "
         f"statistics that hold the true median with {SPREAD} confidence, or, under 6 scenes, their range. Between "
         "two checkpoints quality is taken as linear in log time. Targets are stated with --target psnr=25; else they "
         "are round numbers that the curves pass."
     )
     return [
-        Heading(3, "Time to quality"),
+        Heading(3, f"Time to quality, on {views} test views"),
         Table(tuple(head), tuple(rows)),
         Paragraph(told),
         *bullets(missing),
@@ -261,29 +290,86 @@ def _chosen_targets(configs: Sequence[Configuration], known: Sequence[str], head
     for metric in ON_THE_CURVE:
         for i in known:
             if (Identity.parse(i).metric, Identity.parse(i).region) == (metric, headline):
-                found = [curve for c in configs for curve in curves(c, i).values()]
-                chosen += [Target(metric, value) for value in round_targets(found)]
+                chosen += [Target(metric, value) for value in _round_ones(configs, i)]
                 break
     return chosen
 
 
-def _time_cell(
-    found: Mapping[tuple[str, int], QualityCurve], target: float, identity: str, scenes: Sequence[str]
-) -> str:
+def _round_ones(configs: Sequence[Configuration], identity: str) -> list[float]:
+    """Round qualities that the curves pass, none that the table lacks as long as there are such."""
+    every = [(c, scene, curve) for c in configs for (scene, _), curve in curves(c, identity).items()]
+    kept = []
+    for c, scene, curve in every:
+        most = in_table(c, identity, (scene,))[scene]
+        bound = np.fmin if curve.higher_is_better else np.fmax
+        kept.append(replace(curve, values=bound(curve.values, most)))
+    return round_targets(kept) or round_targets([curve for *_, curve in every])
+
+
+def _time_cell(configuration: Configuration, target: float, identity: str, scenes: Sequence[str]) -> str:
+    """Median seconds; with the views that it stands on wherever the table over all views says something else."""
+    found, metric = curves(configuration, identity), metric_of(identity)
     times = times_to(target, found, scenes)
     if not times:
         return "—"
+    views = f"on {standing(run for run in configuration.runs if run.scene in times)} views"
+    table = in_table(configuration, identity, list(times))
+    has = {scene: value >= target if metric.higher_is_better else value <= target for scene, value in table.items()}
+    says = ""
+    if any(math.isfinite(times[scene]) != has[scene] for scene in times):
+        of_all = f"it in {sum(has.values())} of {len(has)} scenes" if len(has) > 1 else metric.text(*table.values())
+        says = f"; the table has {of_all}"
     reached = sum(math.isfinite(value) for value in times.values())
     if not reached:
-        metric = metric_of(identity)
         values = [curve.best for (scene, _), curve in found.items() if scene in times]
         best = max(values) if metric.higher_is_better else min(values)
-        return f"never (best {metric.text(best)})"
+        return f"never (best {metric.text(best)} {views}{says})"
     interval = median_interval(times, LEVEL)
     shown = _seconds(interval.value)
     if not math.isnan(interval.low):
         shown += f" [{_seconds(interval.low, '')}, {_seconds(interval.high, '')}]"
-    return shown if reached == len(times) else f"{shown}, {reached} of {len(times)} scenes"
+    shown += f", {reached} of {len(times)} scenes" if reached < len(times) else ""
+    return f"{shown} {views}{says}" if says else shown
+
+
+def _end_table(configs: Sequence[Configuration], known: Sequence[str], headline: str) -> list[Block]:
+    """Where the curves end beside what the table has over all views; nothing where they agree as printed."""
+    configs, scenes = comparable(configs)
+    columns = [i for i in known if Identity.parse(i).region == headline and Identity.parse(i).metric in ON_THE_CURVE]
+    rows: list[tuple[Words, ...]] = []
+    for c in configs:
+        cells = [_end_cell(c, i, scenes) for i in columns]
+        if any(cells):
+            rows.append((c.label, *(cell or "as in the table" for cell in cells)))
+    if not rows:
+        return []
+    views = standing(run for c in configs for run in c.runs)
+    told = (
+        f"The last point of the curves, on {views} test views, and the same avatars over all test views, as in the "
+        "table: mean over scenes of the mean over seeds. By so much the curves, the times and the areas are off."
+    )
+    head = [f"{metric_of(i).title} {Identity.parse(i).region}" for i in columns]
+    return [
+        Heading(3, "Where the curves end, and what the table has"),
+        Table(("method", *head), tuple(rows)),
+        Paragraph(told),
+    ]
+
+
+def _end_cell(configuration: Configuration, identity: str, scenes: Sequence[str]) -> str:
+    """ "20.21, in the table 17.80 (+2.41)"; "" where both are printed alike, or one is absent."""
+    metric = metric_of(identity)
+    ends: dict[str, list[float]] = {}
+    for (scene, _), curve in curves(configuration, identity).items():
+        if scene in scenes:
+            ends.setdefault(scene, []).append(float(curve.values[-1]))
+    end = sum(sum(values) / len(values) for values in ends.values()) / len(ends) if ends else math.nan
+    table = list(in_table(configuration, identity, list(ends)).values())
+    whole = sum(table) / len(table) if table else math.nan
+    if not (math.isfinite(end) and math.isfinite(whole)) or metric.text(end) == metric.text(whole):
+        return ""
+    sign = "+" if end > whole else "−"
+    return f"{metric.text(end)}, in the table {metric.text(whole)} ({sign}{metric.text(abs(end - whole))})"
 
 
 def _area_table(configs: Sequence[Configuration], known: Sequence[str]) -> list[Block]:
@@ -309,7 +395,9 @@ def _area_table(configs: Sequence[Configuration], known: Sequence[str]) -> list[
         f"Mean of the metric over the logarithm of fitting time, from {'; '.join(windows)}: from the latest first "
         "checkpoint of any run to the end of the longest fit; a finished fit keeps its last value. Mean over scenes."
     )
-    return [Heading(3, "Area under the quality-time curve"), Table(("method", *head), tuple(rows)), Paragraph(told)]
+    views = standing(run for c in configs for run in c.runs)
+    title = f"Area under the quality-time curve, on {views} test views"
+    return [Heading(3, title), Table(("method", *head), tuple(rows)), Paragraph(told)]
 
 
 def _area_cell(

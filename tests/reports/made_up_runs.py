@@ -36,6 +36,8 @@ def made_up(
     standin="stand-in v1 seed 0",
     device="cpu",
     events=(),
+    views=3,  # test views that the curve stands on
+    of=None,  # of how many; None as runs of earlier versions, which do not say
     stamped=None,  # s between the record's time stamps; None agrees with the ledger
 ) -> RunResult:
     """A run whose regions all have the same PSNR, and FLIP = 10 / PSNR. Its folder holds nothing but the curve."""
@@ -43,11 +45,13 @@ def made_up(
     path = folder / name
     path.mkdir(parents=True, exist_ok=True)
     if curve is not None:
-        lines = []
+        lines, counted = [], {} if of is None else {"of": of}
         for seconds, value in curve:
             scores = {PSNR.format(r): value for r in REGIONS} | {FLIP.format(r): 10 / value for r in REGIONS}
             words = {i: v if math.isfinite(v) else str(v) for i, v in scores.items()}
-            lines.append(json.dumps({"step": int(seconds), "seconds": seconds, "views": 3, "scores": words}))
+            lines.append(
+                json.dumps({"step": int(seconds), "seconds": seconds, "views": views, "scores": words} | counted)
+            )
         (path / "curve.jsonl").write_text("".join(line + "\n" for line in lines))
     means = {}
     for region in REGIONS:

@@ -12,6 +12,8 @@ from ihbench.metrics.statistics import Interval
 from ihbench.quality_time import Target
 from ihbench.reports.configurations import configurations, sweeps
 from ihbench.reports.figures import ROOM, _shown, draw
+from ihbench.reports.html import write as html_write
+from ihbench.reports.latex import write as latex_write
 from ihbench.reports.markdown import markdown, write
 from ihbench.reports.run_time import across_sizes_section, run_time_section, work_points
 from tests.reports.made_up_runs import FLIP, PSNR, made_up, sweep
@@ -25,7 +27,7 @@ def section(runs, *targets):
 
 def cells(text, label, title="Error against run time"):
     """The row's cells by column head, in the table below a title."""
-    part = text.split(f"### {title}\n", 1)[1].split("###", 1)[0]
+    part = text.split(f"### {title}", 1)[1].split("###", 1)[0]
     lines = [[c.strip() for c in line.split("|")[1:-1]] for line in part.splitlines() if line[:1] == "|"]
     (found,) = [row for row in lines if row[0] == label]
     return dict(zip(lines[0], found, strict=True))
@@ -123,9 +125,47 @@ def test_times_are_medians_over_scenes_and_never_is_an_outcome(tmp_path):
     runs = [made_up(tmp_path, s, curve=c) for s, c in (("a", quick), ("b", quick), ("c", slow))]
     text = section(runs, Target("psnr", 20.0), Target("psnr", 31.0), Target("psnr", 12.0, "hidden"))
     found = cells(text, "ours", "Time to quality")
-    assert found["PSNR ≥ 20 dB"] == "4 s [4, never], 2 of 3 scenes"
-    assert found["PSNR ≥ 31 dB"] == "never (best 30.00)"
+    assert found["PSNR ≥ 20 dB"] == (
+        "4 s [4, never], 2 of 3 scenes on 3 of 4 views; the table has it in 3 of 3 scenes"
+    )
+    assert found["PSNR ≥ 31 dB"] == "never (best 30.00 on 3 of 4 views)"
     assert found["PSNR hidden ≥ 12 dB"].startswith("2.3 s [2.3, 4]")
+
+
+def test_a_time_to_a_quality_that_the_table_lacks_says_on_which_views_it_was_reached(tmp_path):
+    runs = [made_up(tmp_path, psnr=17.8), made_up(tmp_path, method="theirs", psnr=23.0)]
+    for write_in in (write, latex_write, html_write):
+        text = write_in(runs, targets=[Target("psnr", 18.0), Target("psnr", 24.0), Target("psnr", 16.0)])
+        assert "4 s on 3 of 4 views; the table has 17.80" in text
+        assert text.count("on 3 of 4 test views") >= 3  # the titles of times and areas, and what is below
+        assert "never (best 23.00 on 3 of 4 views)" in text
+    found = cells(
+        section(runs, Target("psnr", 18.0), Target("psnr", 16.0)), "ours", "Time to quality, on 3 of 4 test views"
+    )
+    assert found["PSNR ≥ 16 dB"] == "2.52 s"  # which all views have, too
+    late = made_up(tmp_path, "b", psnr=25.0)
+    assert cells(section([late], Target("psnr", 24.0)), "ours", "Time to quality")["PSNR ≥ 24 dB"] == (
+        "never (best 23.00 on 3 of 4 views; the table has 25.00)"
+    )
+    several = section([*runs[:1], made_up(tmp_path, "c", psnr=25.0)], Target("psnr", 18.0))
+    assert "4 s on 3 of 4 views; the table has it in 1 of 2 scenes" in several.replace(" [4, 4]", "")
+
+
+def test_where_the_curve_ends_is_said_beside_the_table(tmp_path):
+    title = "Where the curves end, and what the table has"
+    found = cells(section([made_up(tmp_path, psnr=17.8)]), "ours", title)
+    assert found["PSNR body"] == "23.00, in the table 17.80 (+5.20)"
+    assert title not in section([made_up(tmp_path, psnr=23.0)])
+    assert "on all 4 test views" in section([made_up(tmp_path, views=4)])
+    assert "on 3 of 55 or all 4 test views" in section(
+        [made_up(tmp_path, "a", views=4), made_up(tmp_path, "b", of=55)]
+    )
+
+
+def test_round_targets_are_such_as_the_table_has(tmp_path):
+    head = section([made_up(tmp_path, psnr=17.8)]).split("### Time to quality")[1].splitlines()[2]
+    assert all(15 <= float(x) <= 17.8 for x in re.findall(r"PSNR ≥ ([\d.]+) dB", head))
+    assert section([made_up(tmp_path, psnr=12.0)]).count("the table has 12.00") == 3  # none is: then any
 
 
 def test_a_metric_that_is_not_on_the_curve_is_named(tmp_path):
@@ -235,6 +275,8 @@ def test_the_csv_holds_what_the_figure_shows(tmp_path):
     }  # fmt: skip
     curves = list(csv.DictReader(drawn[1].with_suffix(".csv").open()))
     assert {row["kind"] for row in curves} == {"mean"}  # six configurations are a crowd
+    assert {row["test_views"] for row in curves} == {"3 of 4"}
+    assert "on 3 of 4 test views" in drawn[1].with_suffix(".svg").read_text()
     assert {row["identity"] for row in curves} == {x.format(r) for x in (PSNR, FLIP) for r in ("body", "hidden")}
 
 
@@ -248,7 +290,8 @@ def test_an_axis_holds_all_points_and_of_their_bars_what_lies_near():
 
 
 def test_few_configurations_show_their_checkpoints_too(tmp_path):
-    (_, (png, _)) = draw([made_up(tmp_path)], tmp_path / "out")
+    (_, (png, caption)) = draw([made_up(tmp_path)], tmp_path / "out")
+    assert "on 3 of 4 test views" in caption
     rows = list(csv.DictReader(png.with_suffix(".csv").open()))
     dots = [
         (float(r["seconds"]), float(r["value"]))
