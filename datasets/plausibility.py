@@ -173,7 +173,7 @@ def examine(
     _check_softness(capture, masks, report)
     whole_pictures = [view for view, mask in masks.items() if mask.mean() > 0.98]
     if len(whole_pictures) == len(masks):
-        report.problem("the masks cover whole pictures; expected 0 where the person is not (alpha is ignored)")
+        report.problem("the masks cover whole pictures; expected 0 where the person is not")
         return
     if len(empty := [view for view, mask in masks.items() if not mask.any()]) == len(masks):
         report.problem("the masks show no person, all are 0; expected non-zero where the person is seen")

@@ -35,13 +35,17 @@ def _decode(srgb: NDArray) -> NDArray:
     return np.where(srgb <= 0.04045, srgb / 12.92, ((np.maximum(srgb, 0.04045) + 0.055) / 1.055) ** 2.4)
 
 
-CHANGES: dict[str, Callable[[NDArray], NDArray]] = {  # what would be wrong -> what undoes it, on [H, W, 3]
-    "with red and blue exchanged: are they BGR?": lambda image: image[..., ::-1],
+Change = Callable[[NDArray], NDArray]  # [H, W, 3] -> [H, W, 3]
+TURNS: dict[str, Change] = {  # what would be wrong -> what undoes it, of whole images
     "mirrored left to right": lambda image: image[:, ::-1],
     "upside down": lambda image: image[::-1],
+}
+COLOURS: dict[str, Change] = {  # and of any part of them
+    "with red and blue exchanged: are they BGR?": lambda image: image[..., ::-1],
     "encoded as sRGB: are they linear light?": _encode,
     "decoded from sRGB: were they encoded twice?": _decode,
 }
+CHANGES = (*TURNS, *COLOURS)
 
 
 @dataclass(frozen=True)
@@ -71,17 +75,19 @@ class Doubts:
         image = np.clip(image, 0, 1)
         person = bounds(loaded.view.silhouette) or (slice(0, truth.shape[0]), slice(0, truth.shape[1]))
         rows, columns = grown(person, MARGIN, truth.shape)
-        part = truth[rows, columns]
+        part, own = truth[rows, columns], image[rows, columns]
+        changed = [change(image)[rows, columns] for change in TURNS.values()]
+        changed += [change(own) for change in COLOURS.values()]
 
-        def error(changed: NDArray) -> float:
-            return float(np.square(changed[rows, columns] - part).mean())
+        def error(of: NDArray) -> float:
+            return float(np.square(of - part).mean())
 
         behind = (np.abs(truth - self._background) < SAME / 2).all(2)
         self._looks[loaded.index] = _Look(
             loaded.key.name,
-            error(image),
-            tuple(error(change(image)) for change in CHANGES.values()),
-            _moved(image[rows, columns].mean(2), part.mean(2)),
+            error(own),
+            tuple(error(one) for one in changed),
+            _moved(own.mean(2), part.mean(2)),
             np.median(image[behind], 0).astype(np.float64) if behind.sum() >= LEAST_BACKGROUND else None,
             _small(truth),
             _small(image),
@@ -118,10 +124,12 @@ def _changed(looks: list[_Look]) -> Iterator[tuple[float, str]]:
 def _exchanged(doubted: list[_Look], looks: list[_Look]) -> Iterator[tuple[float, str]]:
     """The same, where predictions fit the truths of other views."""
     looks = looks[:MOST_VIEWS]
-    truths = np.stack([look.truth for look in looks])
+    truths = np.stack([look.truth for look in looks]).astype(np.float64)
+    sizes = np.square(truths).mean(1)
     own, nearest, pairs = 0.0, 0.0, []
     for look in doubted[:MOST_VIEWS]:
-        errors = np.square(truths - look.prediction).mean(1)
+        image = look.prediction.astype(np.float64)
+        errors = np.maximum(sizes - 2 * (truths @ image) / len(image) + np.square(image).mean(), 0)
         mine = float(np.square(look.truth - look.prediction).mean())
         own, nearest = own + mine, nearest + float(errors.min())
         if errors.min() < FAR_BETTER**2 * mine:

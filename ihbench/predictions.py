@@ -294,5 +294,5 @@ def _below(root: Path, path: Path) -> str:
 def _some(names: Sequence[str], most: int = 2) -> str:
     """The first names of a list, and how many more there are."""
     if not names:
-        return "no image files"
+        return f"no file that ends in {', '.join(SUFFIXES)}"
     return ", ".join(names[:most]) + (f", … ({len(names)} in all)" if len(names) > most else "")

@@ -26,6 +26,7 @@ FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "PPM", "TGA", "GIF")
 MOST_PIXELS = 2**30 // 12  # 9459 px square: what a header may ask for
 PLAIN_GAMMA = (0.42, 0.48)  # of a PNG's gAMA: 1/2.2 by any rounding
 SAME_COLOUR = 12  # levels by which a profile that calls itself sRGB, or a gamma of 2.2, may differ from it
+SOME = 0.01  # share of pixels that say nothing: renderers clip colours beyond white
 ORIENTATION = 0x0112  # the EXIF tag
 WHITE_IS_ZERO, SAMPLE_FORMAT = 262, 339  # TIFF tags
 OTHER_FILES = {  # what a file that is no such picture begins with -> what it is and what helps
@@ -105,10 +106,23 @@ def read_rgb(path: Path) -> NDArray[np.uint8]:
 
     Raises `BadInput`.
     """
-    colour = read_picture(path).colour
+    picture = read_picture(path)
+    colour, alpha = picture.colour, picture.alpha
+    if alpha is not None and _may_be_premultiplied(colour, alpha, picture.white):
+        raise BadInput(
+            f"{path}: its half transparent pixels look as if they were multiplied with alpha; save it without "
+            f"alpha, on a background"
+        )
     if colour.dtype != np.uint8:
         colour = ((colour.astype(np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
     return np.repeat(colour, 3, 2) if colour.shape[2] == 1 else np.ascontiguousarray(colour)
+
+
+def _may_be_premultiplied(colour: NDArray[Any], alpha: NDArray[Any], white: int) -> bool:
+    """Whether next to none of the half transparent pixels is brighter than its alpha."""
+    half = (alpha > 0) & (alpha < white)
+    brightest = colour[half].max(1).astype(np.int64)
+    return bool(half.any()) and float((brightest > alpha[half] + np.int64(2 * white // 255)).mean()) <= SOME
 
 
 def read_mask(path: Path, person: str) -> NDArray[np.bool_]:
@@ -203,8 +217,8 @@ def _opened(path: Path, name: str) -> Image.Image:
     from PIL import Image, UnidentifiedImageError
 
     warnings.filterwarnings("ignore", module=r"PIL\.")  # lines on stderr about what is refused here anyway
-    if path.is_dir():
-        raise BadInput(f"{name}: is a folder; expected a picture file")
+    if path.exists() and not path.is_file():  # a pipe would be waited for
+        raise BadInput(f"{name}: is {'a folder' if path.is_dir() else 'no regular file'}; expected a picture file")
     try:
         picture = Image.open(path, formats=FORMATS)
     except UnidentifiedImageError as error:
@@ -272,9 +286,8 @@ def _other_colours(profile: bytes) -> str | None:
         source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         name = one_line(ImageCms.getProfileDescription(source)) or "of a profile without a name"
         steps = np.linspace(0, 255, 6).round().astype(np.uint8)
-        mode = {"RGB": "RGB", "GRAY": "L"}.get(
-            ImageCms.getOpenProfile(io.BytesIO(profile)).profile.xcolor_space.strip()
-        )
+        stored: Any = source.profile
+        mode = {"RGB": "RGB", "GRAY": "L"}.get(stored.xcolor_space.strip())
         if mode is None:
             return repr(name)
         colours = np.stack(np.meshgrid(steps, steps, steps), -1).reshape(36, 6, 3)

@@ -1,6 +1,7 @@
 """The one reader of picture files: every kind is right or refused in one line."""
 
 import io
+import os
 import struct
 import zlib
 
@@ -176,6 +177,7 @@ REFUSED = {
         "image",
     ),
     "a folder": (lambda p: p.mkdir(), "a.png", "folder"),
+    "a pipe": (os.mkfifo, "a.png", "no regular file"),
 }
 
 
@@ -208,6 +210,15 @@ def test_ordinary_pictures_are_what_pillow_makes_of_them(tmp_path):
         np.testing.assert_array_equal(read_rgb(tmp_path / "a.png"), Image.open(tmp_path / "a.png").convert("RGB"))
     Image.fromarray(np.tile(RGB, (4, 4, 1))).save(tmp_path / "a.jpg")
     np.testing.assert_array_equal(read_rgb(tmp_path / "a.jpg"), Image.open(tmp_path / "a.jpg"))
+
+
+def test_colours_of_data_that_may_be_multiplied_with_alpha_are_refused(tmp_path):
+    Image.fromarray(np.dstack([np.minimum(RGB, GREY[..., None]), GREY])).save(tmp_path / "a.png")
+    with pytest.raises(BadInput, match="multiplied with alpha; save it without alpha"):
+        read_rgb(tmp_path / "a.png")
+    cut_out = np.dstack([RGB * LABELS[..., None], LABELS * 255])  # nothing half transparent
+    Image.fromarray(cut_out).save(tmp_path / "a.png")
+    np.testing.assert_array_equal(read_rgb(tmp_path / "a.png"), cut_out[..., :3])
 
 
 def test_a_phones_jpeg_with_a_preview_behind_it_is_its_first_picture(tmp_path):
