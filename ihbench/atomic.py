@@ -115,7 +115,12 @@ def write_text(path: Path, text: str) -> None:
 
 def write_json(path: Path, value: Any) -> None:
     """`value` as indented strict JSON (NaN and infinity: see above). Raises `TypeError` for what JSON lacks."""
-    write_text(path, json.dumps(encode(value), indent=2, allow_nan=False) + "\n")
+    write_text(path, json_text(value))
+
+
+def json_text(value: Any) -> str:
+    """What `write_json` writes."""
+    return json.dumps(encode(value), indent=2, allow_nan=False) + "\n"
 
 
 def write_json_lines(path: Path, rows: list[Any]) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench import registry
+from ihbench import outputs, registry
 from ihbench.errors import BadInput
 from ihbench.protocol import Protocol, load_protocol
 from ihbench.scene import Capture
@@ -87,7 +87,7 @@ def add_fitness(found: dict[str, Any], root: Path, body: Body | None, named: Pat
 
     `named` is the folder for overlays, None for the usual one.
     """
-    from ihbench.contact_sheet import write_png
+    from ihbench.files.pictures import encoded
 
     no_place = ""
     overlays = OVERLAYS if named is None else named
@@ -120,7 +120,7 @@ def add_fitness(found: dict[str, Any], root: Path, body: Body | None, named: Pat
             continue
         path = overlays / f"{subject['subject']}.png"
         try:
-            write_png(path, picture)
+            outputs.write_bytes(path, encoded(picture, "PNG", compress_level=1), durable=False)
             subject["overlay"] = str(path)
         except (BadInput, OSError) as error:  # the check is worth having without a picture
             subject["overlay"] = no_place = f"none: {error}; name another folder with --overlays"

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ihbench import atomic
+from ihbench import outputs
 from ihbench.visible_text import visible
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def figure(columns: int = 1, rows: int = 1, width: float = 4.6, height: float = 
 def save(drawn: Figure, path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
     """Write path.png, path.svg and path.csv, each whole or not at all; returns the PNG's path.
 
-    Raises `BadInput` where they cannot be written.
+    Raises `BadInput` where they cannot be written, and where somebody else's files of these names are.
     """
     import matplotlib as mpl
 
@@ -76,7 +76,7 @@ def save(drawn: Figure, path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
             memory = io.BytesIO()
             # an SVG would carry the date, and never be the same file twice
             drawn.savefig(memory, format=kind, dpi=DPI, metadata={"Date": None} if kind == "svg" else None)
-            atomic.write_bytes(path.parent / f"{path.name}.{kind}", memory.getvalue())
+            outputs.write_bytes(path.parent / f"{path.name}.{kind}", memory.getvalue())
     write_csv(path.parent / f"{path.name}.csv", rows)
     return path.parent / f"{path.name}.png"
 
@@ -102,7 +102,7 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     writer.writerow(names)
     for row in rows:
         writer.writerow([_cell(row.get(name)) for name in names])
-    atomic.write_text(path, text.getvalue())
+    outputs.write_text(path, text.getvalue())
 
 
 def _cell(value: Any) -> Any:

@@ -348,5 +348,10 @@ def _is_ours(path: Path) -> bool:
     return path.suffix in WRITTEN.get(top, ()) or atomic.is_stray(path.name)
 
 
+def is_record(path: Path) -> bool:
+    """Whether what has this path in a run folder belongs to the run; an exported avatar does not."""
+    return path.name != "avatar.ply" and _is_ours(path)
+
+
 def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")

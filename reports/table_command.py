@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from ihbench import atomic
+from ihbench import atomic, outputs
 from ihbench.commands.parse import options
 from ihbench.errors import BadInput
 
@@ -43,6 +43,7 @@ class TableCommand:
         from ihbench.reports.paper_numbers import paper_table
         from ihbench.reports.paper_table import build_frame
 
+        outputs.check_file(chosen.out)
         table = paper_table(self.name)
         frame = build_frame(
             table,

@@ -53,7 +53,7 @@ def main(argv: list[str]) -> int:
 
 
 def _ablate(chosen: AblateOptions) -> int:
-    from ihbench.atomic import write_json, write_text
+    from ihbench import outputs
     from ihbench.cells import run_cells
     from ihbench.machine import usable_cores
     from ihbench.progress import Progress
@@ -65,6 +65,8 @@ def _ablate(chosen: AblateOptions) -> int:
     if not chosen.seed or min(chosen.seed) < 0:
         raise BadInput(f"--seed {' '.join(map(str, chosen.seed))}: expected one number or more, each 0 or above")
     check_device(chosen.device)
+    if chosen.out is not None:
+        outputs.check(chosen.out, ["ablation.md", "ablation.json"])
     progress = Progress()
     ladder = _ladder(chosen)
     cells = _cells(chosen, ladder, progress)
@@ -73,10 +75,10 @@ def _ablate(chosen: AblateOptions) -> int:
     outcomes = run_cells([cell for _, cell in cells], workers, threads, progress)
     rungs = [rung for rung, _ in cells]
     text, numbers = registry.load("table", "ablation")(ladder, list(zip(rungs, outcomes, strict=True)))
-    if chosen.out is not None:
-        write_text(chosen.out / "ablation.md", text)
-        write_json(chosen.out / "ablation.json", numbers)
     print(json.dumps(numbers, allow_nan=False) if chosen.json else text)
+    if chosen.out is not None:
+        outputs.write_text(chosen.out / "ablation.md", text)
+        outputs.write_json(chosen.out / "ablation.json", numbers)
     return 0 if all(outcome.done for outcome in outcomes) else 1
 
 

@@ -32,10 +32,12 @@ class ExportOptions:
 
 def main(argv: list[str]) -> int:
     chosen = options(ExportOptions, argv, "export", "An avatar's Gaussians as a standard splat PLY.")
+    from ihbench import outputs
     from ihbench.atomic import is_stream
     from ihbench.run_loop import load_avatar
     from ihbench.splat_ply import write_splat_ply
 
+    outputs.check_file(chosen.out)
     avatar, open_capture = load_avatar(chosen.run, chosen.data, chosen.body)
     if not hasattr(avatar, "gaussians"):
         raise BadInput(f"{chosen.run}: its method has no Gaussians to export")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from ihbench import atomic, registry
+from ihbench import atomic, outputs, registry
 from ihbench.commands.parse import options
 from ihbench.errors import BadInput
 
@@ -58,6 +58,7 @@ def main(argv: list[str]) -> int:
     from ihbench.quality_time import Target
     from ihbench.results import read_result
 
+    outputs.check_file(chosen.out)
     write = registry.load("report", chosen.format)
     folders = chosen.run or _matching(chosen)
     if not folders:

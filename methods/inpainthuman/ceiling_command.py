@@ -47,7 +47,7 @@ def main(argv: list[str]) -> int:
 
 
 def _ceiling(chosen: CeilingOptions) -> int:
-    from ihbench.atomic import write_json, write_text
+    from ihbench import outputs
     from ihbench.methods.inpainthuman.ceiling import ceiling
     from ihbench.progress import Progress
     from ihbench.results import read_result
@@ -57,6 +57,8 @@ def _ceiling(chosen: CeilingOptions) -> int:
     if not chosen.truth:
         raise BadInput("--truth: expected one share or more")
     check_device(chosen.device)
+    if chosen.out is not None:
+        outputs.check(chosen.out, ["ceiling.md", "ceiling.json"])
     results = [read_result(folder) for folder in chosen.run]
     groups = {result.group[:3] for result in results}
     if len(groups) > 1:
@@ -75,8 +77,8 @@ def _ceiling(chosen: CeilingOptions) -> int:
         numbers = {"title": title, "runs": runs}
         text = table(found, title)
         if chosen.out is not None:  # after every run: the next may take minutes
-            write_text(chosen.out / "ceiling.md", text + "\n")
-            write_json(chosen.out / "ceiling.json", numbers)
+            outputs.write_text(chosen.out / "ceiling.md", text + "\n")
+            outputs.write_json(chosen.out / "ceiling.json", numbers)
     print(json.dumps(numbers, allow_nan=False) if chosen.json else text)
     return 0
 

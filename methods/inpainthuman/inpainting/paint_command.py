@@ -56,8 +56,7 @@ def main(argv: list[str]) -> int:
 
 
 def _paint(chosen: Any) -> int:
-    from ihbench import registry
-    from ihbench.atomic import write_bytes, write_json, write_text
+    from ihbench import outputs, registry
     from ihbench.data_source import locate
     from ihbench.methods.inpainthuman.inpainting.grid import png
     from ihbench.methods.inpainthuman.inpainting.paint_table import paint_scene, summary, table
@@ -75,6 +74,8 @@ def _paint(chosen: Any) -> int:
         raise BadInput("--occlusion.fraction: one severity at a time")
     progress, scenes, data = Progress(), {}, ""
     source = locate(protocols[0], chosen.data, chosen.scene)
+    if chosen.out is not None:
+        outputs.check(chosen.out, ["paint.json", "paint.md", *(f"{scene}.png" for scene in source.scenes)])
     for scene in source.scenes:
         capture, body = source.open(scene, chosen.body, progress)
         data = capture.standin or capture.variant
@@ -90,11 +91,11 @@ def _paint(chosen: Any) -> int:
             device=chosen.device,
         )
         if chosen.out is not None:
-            write_bytes(chosen.out / f"{scene}.png", png(picture))
-            write_json(chosen.out / "paint.json", {"scenes": scenes, "summary": summary(scenes)})
+            outputs.write_bytes(chosen.out / f"{scene}.png", png(picture))
+            outputs.write_json(chosen.out / "paint.json", {"scenes": scenes, "summary": summary(scenes)})
     result = summary(scenes)
     text = table(result, f"{protocols[0].name}, {len(scenes)} scenes, {data}")
     if chosen.out is not None:
-        write_text(chosen.out / "paint.md", text + "\n")
+        outputs.write_text(chosen.out / "paint.md", text + "\n")
     print(json.dumps({"scenes": scenes, "summary": result}) if chosen.json else text)
     return 0

@@ -42,6 +42,7 @@ def main(argv: list[str]) -> int:
 
 
 def _train(chosen: Any) -> dict[str, Any]:
+    from ihbench import removal
     from ihbench.data_source import cache_folder
     from ihbench.locks import locked
     from ihbench.methods.inpainthuman.inpainting.mini_card import write_card
@@ -54,6 +55,9 @@ def _train(chosen: Any) -> dict[str, Any]:
     check_device(chosen.device)
     if chosen.out.resolve() == SHIPPED.resolve():
         raise BadInput(f"--out {chosen.out}: holds the shipped backbone; train in a folder of your own")
+    if chosen.start is not None and removal.holds(chosen.start, chosen.out):
+        raise BadInput(f"--out {chosen.out}: holds the backbone to start from; train in a folder of your own")
+    _check_out(chosen.out)
     album = chosen.album or cache_folder() / "album"
     # a GPU waits for one process that draws occluders; on the CPU more processes would only take from each other
     workers = 0 if chosen.device == "cpu" else max((os.cpu_count() or 1) - 2, 0)
@@ -66,6 +70,25 @@ def _train(chosen: Any) -> dict[str, Any]:
         result = validate(backbone, album, chosen.train.each, Progress())
         write_card(chosen.out, chosen.train, trainer.seconds, result, chosen.device, chosen.start)
     return result
+
+
+def _check_out(out: Path) -> None:
+    """Raise `BadInput` where training would overwrite what is not of an earlier training: another model has folders
+    of the same names, and a project a README.md."""
+    from ihbench.methods.inpainthuman.inpainting.mini_card import CARD, FIGURES
+    from ihbench.methods.inpainthuman.inpainting.mini_folder import PARTS, check_mini
+    from ihbench.methods.inpainthuman.inpainting.train_mini import CURVE, STATE
+
+    state = out / TRAINING / STATE
+    names = sorted(name for name in (*PARTS, CARD, FIGURES, TRAINING) if os.path.lexists(out / name))
+    if not names or (state.is_file() and not state.is_symlink()):
+        return
+    if names == [TRAINING] and set(os.listdir(out / TRAINING)) <= {CURVE, "lock", "lock.owner"}:
+        return  # stopped before its first state was saved
+    try:
+        check_mini(out)
+    except BadInput as error:
+        raise BadInput(f"--out {out}: holds {names[0]}, not of a training of mini; choose another folder") from error
 
 
 def _told(result: dict[str, Any], out: Path) -> str:

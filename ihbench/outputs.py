@@ -1,0 +1,110 @@
+"""Files whose names the bench chooses in a folder that the user chose: never over what somebody else put there.
+
+`LIST` in that folder says what was written there, with hashes. A file of the same name that is not in it, or has been
+edited since, is the user's: it stays, and the command says so. A file that the user names is replaced, as with any
+other command.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from ihbench import atomic
+from ihbench.errors import BadInput
+from ihbench.store import is_record
+
+LIST = ".ihbench-written.json"
+
+
+def write_bytes(path: Path, data: bytes, durable: bool = True) -> None:
+    """`atomic.write_bytes` of a file that is new, or that the bench wrote. Raises `BadInput` for another."""
+    if atomic.is_stream(path):
+        atomic.write_bytes(path, data)
+        return
+    digest = hashlib.sha256(data).hexdigest()
+    if _hash(path) == digest:
+        return
+    check(path.parent, [path.name])
+    written = _written(path.parent)
+    # first the list, with the old file and the new: a kill in between must not make a stranger of either
+    _note(path, [*written.get(path.name, []), digest], written)
+    atomic.write_bytes(path, data, durable)
+    _note(path, [digest], written)
+
+
+def write_text(path: Path, text: str) -> None:
+    """`write_bytes` in UTF-8."""
+    write_bytes(path, text.encode("utf-8"))
+
+
+def write_json(path: Path, value: Any) -> None:
+    """As `atomic.write_json` writes."""
+    write_text(path, atomic.json_text(value))
+
+
+def check(folder: Path, names: Iterable[str]) -> None:
+    """Raise `BadInput` where one of these files is there and is somebody else's. For long work, before it begins."""
+    written = _written(folder)
+    for name in names:
+        path = folder / name
+        there = None if atomic.is_stream(path) else _hash(path)
+        if there is not None and there not in written.get(name, []):
+            raise BadInput(
+                f"{path}: is there already and not as ihbench wrote it; move it away, or name another folder"
+            )
+
+
+def check_file(path: Path | None) -> None:
+    """Raise `BadInput` where a file that the user names to be written is a part of a run, a training set or a
+    stand-in. None is fine."""
+    if path is None or not os.path.lexists(path):
+        return
+    where = Path(os.path.realpath(path))
+    for folder in list(where.parents)[:4]:
+        if _is_part(folder, where.relative_to(folder)):
+            raise BadInput(f"{path}: is a part of {folder}, which ihbench wrote; name another file")
+
+
+def _is_part(folder: Path, file: Path) -> bool:
+    if (folder / "run.json").is_file() and is_record(file):
+        return True
+    for name, list_of in (("manifest.json", "files"), ("STANDIN.json", None)):
+        if not (folder / name).is_file():
+            continue
+        with suppress(BadInput):
+            content = atomic.read_json(folder / name)
+            maker = content.get("made_by", content.get("generator")) if isinstance(content, dict) else None
+            if str(maker).startswith("ihbench") and (list_of is None or file.as_posix() in content.get(list_of, ())):
+                return True
+    return False
+
+
+def _written(folder: Path) -> dict[str, list[str]]:
+    """File name -> hashes of what was written under it; empty where nothing was or the list is damaged."""
+    try:
+        content = atomic.read_json(folder / LIST)
+    except BadInput:
+        return {}
+    if not isinstance(content, dict):
+        return {}
+    return {name: hashes for name, hashes in content.items() if isinstance(hashes, list)}
+
+
+def _note(path: Path, hashes: list[str], written: dict[str, list[str]]) -> None:
+    written[path.name] = hashes
+    atomic.write_json(path.parent / LIST, written)
+
+
+def _hash(path: Path) -> str | None:
+    """None where nothing is. What cannot be read is somebody else's."""
+    if not os.path.lexists(path) or (path.is_symlink() and not path.exists()):
+        return None
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError:
+        return ""
