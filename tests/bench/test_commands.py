@@ -143,7 +143,7 @@ def test_a_report_has_three_formats_and_draws_its_figures(bench_with_run, tmp_pa
     assert r"\detokenize{figures/work-precision_zju_occ@1_quick.png}" in out.read_text()
     page = bench_with_run(*words, "--format", "html").out
     assert page.startswith("<!DOCTYPE html>")
-    assert page.count("data:image/png") == 2
+    assert page.count("data:image/png") == 3  # two diagrams and the contact sheet
     table = bench_with_run(*words, "--figures", figures).out
     assert "| method | PSNR ≥ 5 dB | FLIP hidden ≤ 0.9 |" in table
     assert "work-precision_zju_occ@1_quick.png>)" in table
