@@ -241,8 +241,9 @@ def _read(path: Path) -> NDArray:
     if image.ndim == 2:
         image = image[..., None]
     if image.ndim != 3 or image.shape[2] not in (1, 2, 3, 4) or 0 in image.shape:
+        hint = "; move its channels last" if image.ndim == 3 and image.shape[0] in (1, 2, 3, 4) else ""
         raise BadInput(
-            f"prediction {path}: expected an image [H, W], [H, W, 3] or [H, W, 4], got shape {image.shape}"
+            f"prediction {path}: expected an image [H, W], [H, W, 3] or [H, W, 4], got shape {image.shape}{hint}"
         )
     return image
 

@@ -50,6 +50,8 @@ class Prepared:
 
 def read_prepared(folder: Path) -> Prepared:
     """Read the manifests of what `prepare` has written to a folder, or of one scene in it. Raises `BadInput`."""
+    if folder.name == MANIFEST and folder.is_file():
+        folder = folder.parent
     own = folder / MANIFEST
     files = [own] if own.is_file() else sorted(folder.glob(f"*/{MANIFEST}")) if folder.is_dir() else []
     manifests: dict[str, dict[str, Any]] = {}

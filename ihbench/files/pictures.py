@@ -27,6 +27,7 @@ MOST_PIXELS = 2**30 // 12  # 9459 px square: what a header may ask for
 PLAIN_GAMMA = (0.42, 0.48)  # of a PNG's gAMA: 1/2.2 by any rounding
 SAME_COLOUR = 12  # levels by which a profile that calls itself sRGB, or a gamma of 2.2, may differ from it
 SOME = 0.01  # share of pixels that say nothing: renderers clip colours beyond white
+TWELVE_BITS = 4095  # a picture as dark as that in 16 bits holds fewer
 ORIENTATION = 0x0112  # the EXIF tag
 WHITE_IS_ZERO, SAMPLE_FORMAT = 262, 339  # TIFF tags
 OTHER_FILES = {  # what a file that is no such picture begins with -> what it is and what helps
@@ -114,6 +115,11 @@ def read_rgb(path: Path) -> NDArray[np.uint8]:
             f"alpha, on a background"
         )
     if colour.dtype != np.uint8:
+        if 0 < colour.max() <= TWELVE_BITS:
+            raise BadInput(
+                f"{path}: 16 bits a channel, but no value above {colour.max()} of 65535; scale what has 8, 10 or 12 "
+                f"bits, so that white is 65535"
+            )
         colour = ((colour.astype(np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
     return np.repeat(colour, 3, 2) if colour.shape[2] == 1 else np.ascontiguousarray(colour)
 

@@ -221,6 +221,25 @@ def test_colours_of_data_that_may_be_multiplied_with_alpha_are_refused(tmp_path)
     np.testing.assert_array_equal(read_rgb(tmp_path / "a.png"), cut_out[..., :3])
 
 
+@pytest.mark.parametrize("white", [255, 1023, 4095])
+def test_fewer_bits_stored_in_sixteen_are_refused_as_colours_not_as_labels(tmp_path, white):
+    bits16(tmp_path / "a.png", LABELS.astype(np.uint16) * np.uint16(white))
+    with pytest.raises(BadInput, match=f"no value above {white} of 65535"):
+        read_rgb(tmp_path / "a.png")
+    np.testing.assert_array_equal(read_mask(tmp_path / "a.png", "half"), PERSON)
+    bits16(tmp_path / "a.png", np.zeros((4, 4), np.uint16))
+    assert not read_rgb(tmp_path / "a.png").any()
+
+
+@pytest.mark.parametrize("mode", ["P", "RGB", "L"])
+def test_a_transparent_colour_of_a_prediction_shows_the_background(tmp_path, mode):
+    picture = Image.fromarray(LABELS * 200).convert(mode)
+    picture.save(tmp_path / "a.png", transparency=(0, 0, 0) if mode == "RGB" else 0)
+    image = read_image(tmp_path / "a.png", (1.0, 0.5, 0.0))
+    np.testing.assert_allclose(image[~PERSON], np.broadcast_to((1.0, 0.5, 0.0), image[~PERSON].shape))
+    np.testing.assert_allclose(image[PERSON] * 255, 200)
+
+
 def test_a_phones_jpeg_with_a_preview_behind_it_is_its_first_picture(tmp_path):
     Image.fromarray(RGB).save(tmp_path / "a.jpg", "MPO", save_all=True, append_images=[Image.fromarray(RGB[:2, :2])])
     assert read_rgb(tmp_path / "a.jpg").shape == RGB.shape
