@@ -62,6 +62,11 @@ def main(argv: list[str] | None = None) -> int:
     with `--json` one object on stdout."""
     argv = sys.argv[1:] if argv is None else argv
     streams.settle()
+    with streams.shown():
+        return _guarded(argv)
+
+
+def _guarded(argv: list[str]) -> int:
     try:
         with interruptible():
             status = _run(argv)

@@ -5,9 +5,15 @@ from __future__ import annotations
 import codecs
 import io
 import os
+import re
 import sys
-from contextlib import suppress
-from typing import TextIO
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import Any, TextIO
+
+from ihbench.visible_text import visible
+
+STYLE = re.compile(r"(\x1b\[[0-9;]*m)")  # what colours and weighs text on a terminal
 
 
 def _escaped(error: UnicodeError) -> tuple[str, int]:
@@ -66,6 +72,49 @@ def settle() -> None:
     out = sys.stdout
     if type(out) is io.TextIOWrapper:  # not what tests and notebooks put there
         sys.stdout = Stdout(out)
+
+
+@contextmanager
+def shown() -> Iterator[None]:
+    """What is printed inside brings no unseen character of anybody's names to the streams; see `styled`.
+
+    A terminal's stderr is left alone: progress bars move its cursor, and show what they say as it should be.
+    """
+    guarded: list[Any] = [stream for stream in (sys.stdout, sys.stderr) if stream is not None]
+    if sys.stderr is not None and sys.stderr.isatty():
+        guarded.remove(sys.stderr)
+    before = [(stream, stream.write) for stream in guarded]
+    try:
+        for stream, write in before:
+            stream.write = _showing(write, stream.isatty())
+        yield
+    finally:
+        for stream, write in before:
+            stream.write = write
+
+
+def _showing(write: Any, terminal: bool) -> Any:
+    def show(text: str) -> int:
+        if not text.isprintable():
+            parts = STYLE.split(text) if terminal and _styled else [text]
+            text = "".join(part if k % 2 else visible(part, keep="\n\t") for k, part in enumerate(parts))
+        return write(text)
+
+    return show
+
+
+_styled = False
+
+
+@contextmanager
+def styled() -> Iterator[None]:
+    """Text printed inside is the bench's own, and may be in colours where it goes to a terminal."""
+    global _styled
+    before, _styled = _styled, True
+    try:
+        yield
+    finally:
+        _styled = before
 
 
 def failure() -> OSError | None:

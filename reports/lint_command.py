@@ -52,11 +52,7 @@ def main(argv: list[str]) -> int:
             told.add(text)
     if chosen.json:
         rows = [{"file": str(file), **asdict(finding)} for file, findings in found.items() for finding in findings]
-        print(
-            json.dumps(
-                {"status": "found" if rows else "clean", "tables": tables, "findings": rows}, ensure_ascii=False
-            )
-        )
+        print(json.dumps({"status": "found" if rows else "clean", "tables": tables, "findings": rows}))
     else:
         for file, findings in found.items():
             for finding in findings:

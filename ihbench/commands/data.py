@@ -78,7 +78,7 @@ def _check(chosen: Check) -> int:
             complaints.append(f"{name}: {error}")
             continue
         add_fitness(found, folder, body, chosen.overlays)
-        print(json.dumps(found, ensure_ascii=False) if chosen.json else "\n".join(_lines(found)))
+        print(json.dumps(found) if chosen.json else "\n".join(_lines(found)))
         return 0 if found["ok"] else 1
     raise BadInput(f"data folder {chosen.folder}: no known layout ({'; '.join(complaints)})")
 

@@ -32,7 +32,7 @@ def main(argv: list[str]) -> int:
     kinds = KINDS if chosen.kind == "all" else (chosen.kind,)
     found = {kind: _DESCRIBE[kind]() for kind in kinds}
     if chosen.json:
-        print(json.dumps(found, ensure_ascii=False))
+        print(json.dumps(found))
         return 0
     width = max((len(name) for rows in found.values() for name in rows), default=0)
     for kind, rows in found.items():

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from ihbench import streams
 from ihbench.commands.parse import options
 
 if TYPE_CHECKING:
@@ -80,8 +81,8 @@ def _print(comparisons: Sequence[Comparison]) -> None:
                 c.metric, c.case, c.reference, f"{c.ours:.10g}", f"{c.theirs:.10g}", f"{c.difference:.0e}",
                 f"{c.tolerance:.0e}", verdict,
             )  # fmt: skip
-    console = Console()
-    Console(width=max(console.width, TABLE_WIDTH)).print(table)
+    with streams.styled():
+        Console(width=max(Console().width, TABLE_WIDTH)).print(table)
     for why in dict.fromkeys(c.why for c in comparisons if not c.absent):
         allowed = max(c.tolerance for c in comparisons if c.why == why)
         print(f"allowed {allowed:.0e}: {why}")

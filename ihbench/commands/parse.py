@@ -9,7 +9,7 @@ from contextlib import redirect_stderr
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from ihbench import bounds
+from ihbench import bounds, streams
 from ihbench.errors import BadInput
 from ihbench.paths import user_path
 
@@ -37,7 +37,7 @@ def options(kind: type[Options], argv: list[str], command: str, description: str
     _refuse_tyros_own(argv)
     complaint = io.StringIO()
     try:
-        with redirect_stderr(complaint), _spelling():
+        with redirect_stderr(complaint), _spelling(), streams.styled():
             chosen = tyro.cli(
                 kind,
                 args=argv,

@@ -22,7 +22,7 @@ def main(argv: list[str]) -> int:
     protocols = chosen.apply(load_protocol(chosen.protocol, chosen.profile))
     reports = [_planned(chosen, protocol) for protocol in protocols]
     if chosen.json:
-        print(json.dumps(reports[0] if len(reports) == 1 else {"protocols": reports}, ensure_ascii=False))
+        print(json.dumps(reports[0] if len(reports) == 1 else {"protocols": reports}))
         return 0
     for report in reports:
         _print(report)

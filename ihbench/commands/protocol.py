@@ -53,7 +53,7 @@ def _show(chosen: Show) -> int:
     protocols = chosen.apply(load_protocol(chosen.protocol, chosen.profile))
     shown = [_shown(protocol) for protocol in protocols]
     if chosen.json:
-        print(json.dumps(shown[0] if len(shown) == 1 else {"protocols": shown}, ensure_ascii=False))
+        print(json.dumps(shown[0] if len(shown) == 1 else {"protocols": shown}))
         return 0
     for k, content in enumerate(shown):
         pairs = list(flatten(content))
@@ -72,7 +72,7 @@ def _diff(chosen: Diff) -> int:
     a, b = load_protocol(chosen.a, chosen.profile), load_protocol(chosen.b, chosen.profile)
     rows = difference(a, b)
     if chosen.json:
-        print(json.dumps([{"key": k, chosen.a: x, chosen.b: y} for k, x, y in rows], ensure_ascii=False))
+        print(json.dumps([{"key": k, chosen.a: x, chosen.b: y} for k, x, y in rows]))
         return 0
     for key, left, right in rows:
         print(key)

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from ihbench import machine, registry
+from ihbench import machine, registry, streams
 from ihbench.errors import BadInput
 from ihbench.kernels.measuring import UNSTABLE, Row
 from ihbench.kernels.metrics import flip_rows, frame_rows, lpips_rows, ssim_rows
@@ -97,12 +97,13 @@ def _print_table(about: Row, rows: list[Row]) -> None:
         of = row["kernel"], row["case"], row["backend"]
         table.add_row(*of, forward, f"{row['ratio']:.2f}", backward, memory, *errors, note)
     console = Console(width=max(Console().width, TABLE_WIDTH))
-    console.print(table)
+    with streams.styled():
+        console.print(table)
     gpu = f", {about['gpu']}" if about["gpu"] else ""
-    console.print(f"{about['cpu']}, {about['torch_threads']} threads{gpu}, load average {about['load_average']}")
+    print(f"{about['cpu']}, {about['torch_threads']} threads{gpu}, load average {about['load_average']}")
     if busy(about):
-        console.print(f"Other work is running here (load above {machine.BUSY} per core): these times are unstable.")
-    console.print(
+        print(f"Other work is running here (load above {machine.BUSY} per core): these times are unstable.")
+    print(
         f"Median ± half the interquartile range; unstable: the range exceeds {UNSTABLE:.0%} of the median; ratio: of"
         " the forward time to that of the case's first row. Errors of splats are against the float64 twin in a window"
         f" of {WINDOW}² px (image: largest; gradient: relative norm), those of the z-buffer its depth's, in m,"

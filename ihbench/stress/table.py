@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from itertools import groupby
 from typing import Any
 
+from ihbench import streams
 from ihbench.stress.case import Outcome
 
 TABLE_WIDTH = 150  # characters; a narrower terminal would cut the numbers
@@ -48,8 +49,8 @@ def print_table(outcomes: Sequence[Outcome], seconds: float, processor_seconds: 
         for outcome in group:
             table.add_row(*_cells(outcome))
         table.add_section()
-    console = Console()
-    Console(width=max(console.width, TABLE_WIDTH)).print(table)
+    with streams.styled():
+        Console(width=max(Console().width, TABLE_WIDTH)).print(table)
     for outcome in outcomes:
         if outcome.verdict != "passed":
             print(f"{outcome.verdict}: {outcome.case.name}: {outcome.reason}")
