@@ -22,6 +22,8 @@ class ExportOptions:
     """Format."""
     pose: str = "a_pose"
     """A named canonical pose, or the number of a frame of the run's capture, such as 120."""
+    axes: Literal["viewer", "world"] = "viewer"
+    """viewer: upright in splat viewers, the pelvis at the origin; world: the coordinates of the data set."""
     out: Path | None = None
     """File to write; by default `avatar.ply` in the run folder."""
     data: Path | None = None
@@ -32,18 +34,28 @@ class ExportOptions:
 
 def main(argv: list[str]) -> int:
     chosen = options(ExportOptions, argv, "export", "An avatar's Gaussians as a standard splat PLY.")
+    import numpy as np
+
     from ihbench import outputs
     from ihbench.atomic import is_stream
     from ihbench.run_loop import load_avatar
-    from ihbench.splat_ply import write_splat_ply
+    from ihbench.splat_ply import UPRIGHT, VIEWER_TURN, write_splat_ply
 
     outputs.check_file(chosen.out)
     avatar, open_capture = load_avatar(chosen.run, chosen.data, chosen.body)
     if not hasattr(avatar, "gaussians"):
         raise BadInput(f"{chosen.run}: its method has no Gaussians to export")
-    means, scales, colors = avatar.gaussians(_pose(chosen.pose, avatar, open_capture))
+    pose = _pose(chosen.pose, avatar, open_capture)
+    means, scales, colors = (values.detach().cpu().numpy() for values in avatar.gaussians(pose))
+    finite = np.isfinite(np.column_stack([means, scales, colors])).all(1)
+    if not finite.all():  # the renderer does not draw them either
+        print(f"ihbench: {int((~finite).sum())} Gaussians that are not finite are left out", file=sys.stderr)
+        means, scales, colors = means[finite], scales[finite], colors[finite]
+    rotation = UPRIGHT
+    if chosen.axes == "viewer":
+        means, rotation = _for_viewers(means, pose, avatar, chosen), VIEWER_TURN
     out = chosen.out or chosen.run / "avatar.ply"
-    write_splat_ply(out, means.cpu().numpy(), scales.cpu().numpy(), colors.cpu().numpy())
+    write_splat_ply(out, means, scales, colors, _comments(chosen), rotation)
     said = sys.stderr if is_stream(out) else sys.stdout  # which may be the file itself
     print(f"{len(means)} Gaussians in pose {chosen.pose} written to {out}", file=said)
     return 0
@@ -58,3 +70,36 @@ def _pose(name: str, avatar: Any, open_capture: Any) -> Any:
     if WHOLE.fullmatch(name):
         return open_capture().body_pose(whole(name))
     return BodyPose(canonical_pose(name), avatar.betas, np.zeros(3))
+
+
+def _for_viewers(means: Any, pose: Any, avatar: Any, chosen: ExportOptions) -> Any:
+    """[N, 3] m, upright about the pelvis of the avatar's own body."""
+    from ihbench.body.skinning_numpy import axis_angle_to_matrix
+    from ihbench.reopen import reopen_body
+    from ihbench.scene import BodyPose
+    from ihbench.splat_ply import in_viewer_axes
+
+    body = getattr(avatar, "body", None) or reopen_body(chosen.run, chosen.data, chosen.body)
+    pelvis = body.posed_joints(BodyPose(pose.pose, avatar.betas, pose.transl))[0]
+    return in_viewer_axes(means, pelvis, axis_angle_to_matrix(pose.pose[0]))
+
+
+def _comments(chosen: ExportOptions) -> list[str]:
+    """What the file says of itself. Brush and splat-transform read the last."""
+    import ihbench
+    from ihbench.store import RunFolder
+
+    folder = RunFolder.open(chosen.run)
+    identity = folder.identity
+    axes = {
+        "viewer": "y down, z forward (180 degrees about z from y-up); the pelvis at the origin",
+        "world": "those of the data set",
+    }[chosen.axes]
+    return [
+        f"Exported from ihbench {ihbench.__version__}",
+        f"run: {folder.record['digest']} {identity['method']} {identity['scene']}",
+        f"pose: {chosen.pose}",
+        "units: metres",
+        f"axes: {axes}",
+        "SplatRenderMode: default",
+    ]

@@ -11,6 +11,7 @@ import pytest
 from ihbench import registry
 from ihbench.atomic import read_json, read_json_lines
 from ihbench.body.canonical import canonical_pose
+from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.data_source import standin_root
 from ihbench.results import read_result
 from ihbench.run_loop import load_avatar
@@ -178,7 +179,7 @@ def test_a_damaged_run_does_not_take_the_others_with_it(bench_with_run, finished
 def test_export_writes_the_avatars_gaussians_in_the_pose_asked_for(bench_with_run, tmp_path, pose):
     (folder,) = bench_with_run.folders()
     out = tmp_path / "avatar.ply"
-    outcome = bench_with_run("export", folder, "--to", "ply", "--pose", pose, "--out", out)
+    outcome = bench_with_run("export", folder, "--to", "ply", "--pose", pose, "--axes", "world", "--out", out)
     assert outcome.status == 0, outcome.err
     means, scales, colors = read_splat_ply(out.read_bytes())
     with bench_with_run.in_its_world():
@@ -195,6 +196,20 @@ def test_export_writes_the_avatars_gaussians_in_the_pose_asked_for(bench_with_ru
     np.testing.assert_allclose(colors, expected[2], atol=1e-6)
     body = avatar.body.pose(body_pose)
     np.testing.assert_allclose([means.min(0), means.max(0)], [body.min(0), body.max(0)], atol=0.05)
+
+    bench_with_run("export", folder, "--pose", pose, "--out", out)
+    seen = read_splat_ply(out.read_bytes())[0]
+    pelvis, root = avatar.body.posed_joints(body_pose)[0], axis_angle_to_matrix(body_pose.pose[0])
+    np.testing.assert_allclose(seen * (-1, -1, 1) @ root.T + pelvis, means, atol=1e-5)
+    assert seen[:, 1].min() < -0.3  # the head is up where y points down, the feet are down
+    assert seen[:, 1].max() > 0.6
+    head = out.read_bytes().partition(b"end_header")[0].decode("ascii").splitlines()
+    assert [line for line in head if line.startswith("comment")][2:] == [
+        f"comment pose: {pose}",
+        "comment units: metres",
+        "comment axes: y down, z forward (180 degrees about z from y-up); the pelvis at the origin",
+        "comment SplatRenderMode: default",
+    ]
 
 
 def test_export_lies_in_the_run_folder_unless_told_otherwise(bench_with_run):

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from ihbench.errors import BadInput
-from ihbench.splat_ply import read_splat_ply, splat_ply, write_splat_ply
+from ihbench.splat_ply import VIEWER_TURN, in_viewer_axes, read_splat_ply, splat_ply, write_splat_ply
 
 # the order and names in which the released 3D Gaussian splatting code writes them, without the higher harmonics
 FIELDS = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
@@ -58,6 +59,44 @@ def test_every_field_means_what_a_viewer_takes_it_for():
     assert (table["rot_0"] == 1).all()  # the real part comes first
     opacity = 1 / (1 + np.exp(-table["opacity"].astype(float)))
     np.testing.assert_allclose(opacity, 0.999, atol=1e-6)
+
+
+def test_comments_stand_in_the_header_in_one_line_each():
+    lines, table = parse(splat_ply(*some(3), ["units: metres", "pose: é\nelement vertex 9", "\x1b[31mend_header"]))
+    assert lines[:3] == ["ply", "format binary_little_endian 1.0", "comment units: metres"]
+    assert [line.startswith("comment ") for line in lines[2:5]] == [True] * 3
+    assert lines[5] == "element vertex 3"
+    assert len(table) == 3
+    assert np.array_equal(read_splat_ply(splat_ply(*some(3), ["element vertex 9"]))[0], some(3)[0])
+
+
+def test_viewer_axes_turn_an_upright_body_by_half_a_turn_about_z():
+    root = Rotation.from_rotvec([0.3, -2.0, 1.0]).as_matrix()
+    own = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1], [0.2, -0.9, 0.1]])  # head up, left hand, nose, a foot
+    pelvis = np.array([5.0, -3, 100])
+    turned = in_viewer_axes(own @ root.T + pelvis, pelvis, root)
+    np.testing.assert_allclose(turned, [[0, -1, 0], [-1, 0, 0], [0, 0, 1], [-0.2, 0.9, 0.1]], atol=1e-5)
+    w, x, y, z = VIEWER_TURN
+    np.testing.assert_allclose(Rotation.from_quat([x, y, z, w]).apply(own), turned, atol=1e-5)
+    _, table = parse(splat_ply(*some(2), rotation=VIEWER_TURN))
+    assert [float(table[f"rot_{k}"][0]) for k in range(4)] == list(VIEWER_TURN)
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        (lambda m, s, c: (m.T, s, c), "means"),
+        (lambda m, s, c: (m, np.repeat(s[:, None], 3, 1), c), "scales"),
+        (lambda m, s, c: (m, s, c[:, :1]), "colors"),
+        (lambda m, s, c: (m, np.log(s), c), "logarithms"),
+        (lambda m, s, c: (m, s, c * 255), "divide 8-bit"),
+        (lambda m, s, c: (m, s, (c * 255).astype(np.uint8)), "divide 8-bit"),
+        (lambda m, s, c: (m * np.nan, s, c), "finite"),
+    ],
+)
+def test_other_gaussians_are_refused(change, word):
+    with pytest.raises(ValueError, match=word):
+        splat_ply(*change(*some(5)))
 
 
 def test_a_scale_of_zero_stays_finite():
