@@ -49,7 +49,7 @@ class CaptureFolder(ABC):
         if self._mark and self._mark["body_sha"] != body.content_sha():
             raise BadInput(
                 f"{self.folder}: made with another version of the procedural body than this ihbench has; "
-                f"remove the stand-in and make it anew"
+                f"make it anew in another folder"
             )
         return body
 

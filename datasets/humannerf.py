@@ -98,7 +98,7 @@ class HumanNerfCapture(CaptureFolder):
                 )
             key = match[1] or MONOCULAR, int(match[2])
             if key in self._names:
-                raise BadInput(f"{folder / 'cameras.pkl'}: frame {key[1]} is there twice; remove one of them")
+                raise BadInput(f"{folder / 'cameras.pkl'}: frame {key[1]} is there twice; move one of the two away")
             self._names[key] = str(name)
         ids = sorted({camera for camera, _ in self._names} - {MONOCULAR}, key=int)
         if any(camera == MONOCULAR for camera, _ in self._names):

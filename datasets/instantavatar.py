@@ -113,7 +113,7 @@ class InstantAvatarCapture(SnapshotFolder):
                     other = self._row_of[frame][0]
                     raise BadInput(
                         f"{folder / REFINED[split]}: frame {frame} has refined poses in {REFINED[other]}, too; "
-                        f"expected each frame once, remove one of the files"
+                        f"expected each frame once, move one of the files away"
                     )
                 self._row_of[frame] = split, row
         self.variant = "instantavatar/anim_nerf" if self.refined else "instantavatar"
@@ -253,7 +253,7 @@ def read_refined(
             known = f"its {split} split has {len(official)}" if official else "it has no official split"
             raise BadInput(
                 f"{path}: {count} poses, but no 'frames' says whose, and of {subject!r} is known that {known}; "
-                f"add the frame numbers as 'frames', or remove the file"
+                f"add the frame numbers as 'frames', or move the file away"
             )
         frames = list(official)
     if min(frames) < 0 or max(frames) >= n_frames:

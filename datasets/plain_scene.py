@@ -119,7 +119,7 @@ class PlainCapture(CaptureFolder):
             if body is not None and body.content_sha() != self.model.content_sha():
                 raise BadInput(
                     f"{folder / BODY_FILE}: the scene has its own body, but another ({body.name}) was given; "
-                    f"give no body file, or remove {BODY_FILE}"
+                    f"give no body file, or move {BODY_FILE} away"
                 )
 
     @cached_property

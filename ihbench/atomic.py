@@ -280,9 +280,19 @@ def _explained(error: OSError, path: Path) -> Exception:
     if error.errno in USER_ERRORS:
         return BadInput(
             f"{USER_ERRORS[error.errno]} while writing {path}: nothing was changed; "
-            f"make room or choose another folder, then run the same command again"
+            f"make room or {_advice(path)}, then run the same command again"
         )
     return error
+
+
+def _advice(path: Path) -> str:
+    """How another folder is chosen: the cache's by a variable."""
+    from ihbench.data_source import cache_folder
+
+    with suppress(BadInput, OSError):
+        if os.path.abspath(path).startswith(os.path.abspath(cache_folder()) + os.sep):
+            return "name another folder for the cache with IHBENCH_CACHE"
+    return "choose another folder"
 
 
 def _read_text(path: Path) -> str:
@@ -297,4 +307,6 @@ def _parsed(path: Path, text: str, where: str = "") -> Any:
         return decode(json.loads(text))
     except (ValueError, RecursionError) as error:
         detail = f"{error}" if isinstance(error, ValueError) else "nested too deeply"
-        raise BadInput(f"{path}{where}: not valid JSON ({detail}); restore the file or remove it") from error
+        raise BadInput(
+            f"{path}{where}: not valid JSON ({detail}); restore it from a copy, or move it away"
+        ) from error

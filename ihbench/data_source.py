@@ -10,7 +10,7 @@ from ihbench import registry
 from ihbench.body import Body, load_body
 from ihbench.bounds import LARGEST_CAST
 from ihbench.errors import BadInput
-from ihbench.paths import path_from, user_path
+from ihbench.paths import path_from, users_cache
 from ihbench.progress import Progress
 from ihbench.protocol import Protocol
 from ihbench.scene import Capture
@@ -22,8 +22,14 @@ STANDIN_SEED = 0
 
 
 def cache_folder() -> Path:
-    """`IHBENCH_CACHE`, or `ihbench` in the user's cache folder."""
-    return path_from("IHBENCH_CACHE") or (path_from("XDG_CACHE_HOME") or user_path("~/.cache", "cache")) / "ihbench"
+    """`IHBENCH_CACHE`, or `ihbench` in the user's cache folder. Raises `BadInput` where there is neither."""
+    own = path_from("IHBENCH_CACHE")
+    if own is not None:
+        return own
+    users = users_cache()
+    if users is None:
+        raise BadInput("this user has no home folder to keep stand-ins in; name a folder for them with IHBENCH_CACHE")
+    return users / "ihbench"
 
 
 def own_data(data: Path | None) -> Path | None:

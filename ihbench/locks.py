@@ -63,7 +63,7 @@ def locked(
 
 def is_held(file: Path) -> bool:
     """Whether somebody holds the lock. In a place that may not be written nobody here does."""
-    if not file.exists() and not _owner_file(file).exists():
+    if not os.path.exists(file) and not os.path.exists(_owner_file(file)):
         return False
     try:
         lock = _system_lock(file)

@@ -71,10 +71,10 @@ def check_file(path: Path | None) -> None:
 
 
 def _is_part(folder: Path, file: Path) -> bool:
-    if (folder / "run.json").is_file() and is_record(file):
+    if os.path.isfile(folder / "run.json") and is_record(file):
         return True
     for name, list_of in (("manifest.json", "files"), ("STANDIN.json", None)):
-        if not (folder / name).is_file():
+        if not os.path.isfile(folder / name):
             continue
         with suppress(BadInput):
             content = atomic.read_json(folder / name)

@@ -48,3 +48,12 @@ def path_from(variable: str) -> Path | None:
     """The path in an environment variable; None where it is not set or empty. Raises `BadInput` as `user_path`."""
     words = os.environ.get(variable)
     return user_path(words, variable) if words else None
+
+
+def users_cache() -> Path | None:
+    """The folder in which programs keep what can be made again: `XDG_CACHE_HOME`, else ~/.cache; None for a user
+    without a home, as containers and batch systems have them."""
+    try:
+        return path_from("XDG_CACHE_HOME") or Path("~/.cache").expanduser()
+    except RuntimeError:
+        return None

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from ihbench import atomic, registry
 from ihbench.errors import BadInput
-from ihbench.paths import path_from, user_path
+from ihbench.paths import path_from, users_cache
 from ihbench.progress import Progress
 
 CHUNK = 2**20  # bytes
@@ -63,24 +63,35 @@ def find_weights(name: str) -> WeightFile:
 
 
 def folders() -> list[Path]:
-    """Where weight files are looked for, in order. The last is torch's own, found without importing torch."""
-    own = path_from("IHBENCH_WEIGHTS")
-    torch_home = path_from("TORCH_HOME") or (path_from("XDG_CACHE_HOME") or user_path("~/.cache", "cache")) / "torch"
-    return [*([own] if own else []), torch_home / "hub" / "checkpoints"]
+    """Where weight files are looked for, in order. The last is torch's own, found without importing torch.
+
+    Raises `BadInput` where there is none, and for variables that name no folder.
+    """
+    own, torch_home, users = path_from("IHBENCH_WEIGHTS"), path_from("TORCH_HOME"), users_cache()
+    if torch_home is None and users is not None:
+        torch_home = users / "torch"
+    found = [*([own] if own else []), *([torch_home / "hub" / "checkpoints"] if torch_home else [])]
+    if not found:
+        raise BadInput("this user has no home folder to keep weights in; name a folder for them with IHBENCH_WEIGHTS")
+    return found
 
 
 def locate(weights: WeightFile) -> Path | str:
     """The file, or why there is none, in a line: what is missing, where it goes, how to get it."""
     damaged = ""
-    for folder in folders():
+    try:
+        places = folders()
+    except BadInput as error:
+        return f"{weights.used_by} needs {weights.file}: {error}"
+    for folder in places:
         path = folder / weights.file
-        if path.is_file():
+        if os.path.isfile(path):  # Path's own raises in other users' folders
             if is_right(weights, path):
                 return path
             damaged = f"{_short(path)} is damaged or another file (its hash does not begin with {weights.sha256}); "
     what = f"{damaged}move it away, then put the right one" if damaged else "missing; put it"
     return (
-        f"{weights.used_by} needs {weights.file}: {what} into {_short(folders()[0])}, or on a connected machine run: "
+        f"{weights.used_by} needs {weights.file}: {what} into {_short(places[0])}, or on a connected machine run: "
         f"ihbench weights fetch {weights.name}"
     )
 
@@ -153,7 +164,7 @@ def states(names: Iterable[str] = FILES) -> list[dict[str, object]]:
     for name in names:
         weights = find_weights(name)
         paths = [folder / weights.file for folder in folders()]
-        present = [path for path in paths if path.is_file()]
+        present = [path for path in paths if os.path.isfile(path)]
         right = [path for path in present if is_right(weights, path)]
         found.append(
             {

@@ -53,9 +53,7 @@ def claim(root: Path, version: int, seed: int, body: Body) -> None:
     if path.is_file():
         found = atomic.read_json(path)
         if found != mark:
-            raise BadInput(
-                f"{root}: holds another stand-in ({_differences(found, mark)}); choose another folder or remove it"
-            )
+            raise BadInput(f"{root}: holds another stand-in ({_differences(found, mark)}); choose another folder")
         return
     if root.exists() and (not root.is_dir() or any(root.iterdir())):
         raise BadInput(f"{root}: not an empty folder and not a stand-in; choose another folder")

@@ -149,6 +149,42 @@ def test_a_file_that_may_not_be_read_is_named_not_raised(folder, monkeypatch):
     assert weights.states([SQUEEZE])[0]["state"] == "damaged"
 
 
+@pytest.fixture
+def homeless(monkeypatch):
+    """A user that the system knows neither a name nor a home of, as containers have them."""
+    import pwd
+
+    for variable in ("HOME", "IHBENCH_CACHE", "IHBENCH_WEIGHTS", "TORCH_HOME", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(variable, raising=False)
+
+    def unknown(number):
+        raise KeyError(number)
+
+    monkeypatch.setattr(pwd, "getpwuid", unknown)
+
+
+def test_without_a_home_a_reason_is_given_and_no_run_fails_for_it(homeless, monkeypatch, tmp_path, capsys):
+    reason = weights.locate(weights.FILES[SQUEEZE])
+    assert isinstance(reason, str)
+    assert "name a folder for them with IHBENCH_WEIGHTS" in reason
+    monkeypatch.setattr(lpips, "_loaded", {})
+    case = person_case()
+    (score,) = (score for score in evaluate(case.pred, case.truth, {"full": None}).values() if score.absent)
+    assert "IHBENCH_WEIGHTS" in score.reason
+    assert main(["weights", "list"]) == 2
+    assert main(["run", "--protocol", "zju_occ", "--runs", str(tmp_path / "runs")]) == 2
+    assert "IHBENCH_CACHE" in capsys.readouterr().err
+    assert not (tmp_path / "runs").exists()
+    monkeypatch.setenv("IHBENCH_WEIGHTS", str(tmp_path))
+    assert weights.folders() == [tmp_path]
+
+
+def test_a_cache_that_may_not_be_written_is_named_with_its_variable(monkeypatch, capsys):
+    monkeypatch.setenv("IHBENCH_CACHE", "/proc/nope")
+    assert main(["run", "--protocol", "people_snapshot", "--scene", "standin-1"]) == 2
+    assert "name another folder for the cache with IHBENCH_CACHE" in capsys.readouterr().err
+
+
 def test_the_commands(folder, capsys):
     assert main(["weights", "list", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
