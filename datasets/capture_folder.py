@@ -15,6 +15,8 @@ from ihbench.datasets.standin_mark import standin_mark
 from ihbench.errors import BadInput
 from ihbench.scene import BodyPose
 
+BY_OPTIONS = "(--train-frames, --test-frames)"  # how a frame of a fixed recording is left out
+
 
 class CaptureFolder(ABC):
     """One subject's folder. A format adds what `ihbench.scene.Capture` asks for."""

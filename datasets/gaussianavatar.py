@@ -42,6 +42,7 @@ from ihbench.datasets.people_snapshot import (
 )
 from ihbench.errors import BadInput
 from ihbench.files.pictures import encoded, read_mask, read_rgb, size_of
+from ihbench.files.spelling import missing_file
 from ihbench.files.tensors import read_tensors
 from ihbench.paths import user_path
 from ihbench.scene import BodyPose
@@ -164,7 +165,7 @@ class GaussianAvatarCapture(SnapshotFolder):
         self.check_source(source)
         path = self.mask_path(frame)
         if not path.is_file():
-            raise BadInput(f"{path}: no such file; expected the mask of frame {frame}{self.standin_hint}")
+            raise missing_file(path, f"expected the mask of frame {frame}{self.standin_hint}")
         mask = read_mask(path, "half")
         self.check_size(path, mask, self._camera)
         return mask
@@ -240,7 +241,7 @@ def read_poses(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], ND
     import torch
 
     if not path.is_file():
-        raise BadInput(f"{path}: no such file; expected beta, body_pose and trans of the split's images")
+        raise missing_file(path, "expected beta, body_pose and trans of the split's images")
     content = read_tensors(path)
     sizes = {"body_pose": 72, "trans": 3, "beta": 10}
     if not sizes.keys() <= content.keys():

@@ -30,6 +30,7 @@ from ihbench.datasets.pickles import write_pickle
 from ihbench.datasets.plausibility import Outline, examine
 from ihbench.errors import BadInput
 from ihbench.files.pictures import encoded, read_mask, read_rgb, size_of
+from ihbench.files.spelling import missing_file
 from ihbench.paths import user_path
 from ihbench.registry import nearest
 from ihbench.safe_pickle import load_pickle
@@ -189,7 +190,7 @@ class HumanNerfCapture(CaptureFolder):
             raise BadInput(f"{self.folder}: no frame {frame} of camera {self.camera_ids[camera]} in cameras.pkl")
         path = self._picture(kind, name)
         if not path.is_file():
-            raise BadInput(f"{path}: no such file; cameras.pkl lists it")
+            raise missing_file(path, "cameras.pkl lists it")
         picture = read(path)
         size = self.camera(camera)
         if picture.shape[:2] != (size.height, size.width):
@@ -244,7 +245,7 @@ def check(dataset: HumanNerfFormat, body: Body | None = None, samples: int = 4) 
     subjects = []
     for name in dataset.subjects():
         problems: list[str] = []
-        found: dict[str, Any] = {"subject": name, "problems": problems}
+        found: dict[str, Any] = {"subject": name, "problems": problems, "warnings": []}
         try:
             capture = dataset.open(name, _fitting(dataset, name, body))
             views = sorted((c, f) for c in range(len(capture.camera_ids)) for f in range(capture.n_frames)

@@ -43,6 +43,7 @@ from ihbench.datasets.people_snapshot import (
 )
 from ihbench.errors import BadInput
 from ihbench.files.pictures import above_half, encoded, read_rgb
+from ihbench.files.spelling import missing_file
 from ihbench.paths import user_path
 from ihbench.safe_pickle import load_npy
 from ihbench.scene import BodyPose
@@ -136,7 +137,7 @@ class InstantAvatarCapture(SnapshotFolder):
         self.check_index(camera, frame)
         path = self.image_path(frame)
         if not path.is_file():
-            raise BadInput(f"{path}: no such file; expected the image of frame {frame}{self.standin_hint}")
+            raise missing_file(path, f"expected the image of frame {frame}{self.standin_hint}")
         image = read_rgb(path)
         self.check_size(path, image, self._camera)
         return image
@@ -147,7 +148,7 @@ class InstantAvatarCapture(SnapshotFolder):
         self.check_source(source)
         path = self.mask_path(frame)
         if not path.is_file():
-            raise BadInput(f"{path}: no such file; expected the mask of frame {frame}{self.standin_hint}")
+            raise missing_file(path, f"expected the mask of frame {frame}{self.standin_hint}")
         mask = read_mask(path)
         self.check_size(path, mask, self._camera)
         return mask
@@ -299,7 +300,9 @@ def _inspect(capture: InstantAvatarCapture, samples: int, found: dict[str, Any])
     if not capture.standin:
         problems += [f"{n} of {what} missing" for what, n in found["missing"].items() if n]
     if surplus := sum(frame >= len(capture._poses[0]) for frame in capture.images):
-        problems.append(f"{surplus} images have no pose in {POSES_FILE}")
+        found["warnings"].append(f"{surplus} images have no pose in {POSES_FILE} and are not used")
+    if not capture.standin and (surplus := len(capture._poses[0]) - capture.n_frames) > 0:
+        found["warnings"].append(f"{surplus} poses after the last image are not used")
     for name, poses in (
         (POSES_FILE, capture._poses[:2]),
         *((REFINED[s], r[1:3]) for s, r in capture.refined.items()),

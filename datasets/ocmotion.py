@@ -30,11 +30,12 @@ from numpy.typing import NDArray
 from ihbench import atomic
 from ihbench.body import Body
 from ihbench.camera import Camera
-from ihbench.datasets.capture_folder import CaptureFolder
+from ihbench.datasets.capture_folder import BY_OPTIONS, CaptureFolder
 from ihbench.datasets.pickles import write_pickle
 from ihbench.datasets.plausibility import Outline, examine
 from ihbench.errors import BadInput
 from ihbench.files.pictures import encoded, read_mask, read_rgb, size_of
+from ihbench.files.spelling import missing_file
 from ihbench.paths import user_path
 from ihbench.registry import nearest
 from ihbench.safe_pickle import load_pickle
@@ -81,7 +82,7 @@ class OneCameraCapture(CaptureFolder):
         """[H, W, 3] RGB, as stored."""
         path = self.image_path(camera, frame)
         if not path.is_file():
-            raise BadInput(f"{path}: no such file; expected the image of frame {frame}{self.standin_hint}")
+            raise missing_file(path, f"expected the image of frame {frame}{self.standin_hint}")
         image = read_rgb(path)
         self._check_size(path, image)
         return image
@@ -92,7 +93,7 @@ class OneCameraCapture(CaptureFolder):
             raise BadInput(f"silhouette source {source!r}: {nearest(source, list(SILHOUETTES))}")
         path = self.mask_path(camera, frame)
         if not path.is_file():
-            raise BadInput(f"{path}: no such file; {self._mask_hint}{self.standin_hint}")
+            raise missing_file(path, f"{self._mask_hint}{self.standin_hint}")
         mask = read_mask(path, "first channel")  # OccFusion reads a palette's red
         self._check_size(path, mask)
         return mask
@@ -382,7 +383,7 @@ def numbers(content: Mapping, key: str, shape: tuple[int, ...], where: str) -> A
             raise BadInput(f"{where}: {wanted}, found {list(value.shape)}")
         value = value.squeeze()
     if not np.isfinite(value).all():
-        raise BadInput(f"{where}: NaN or infinity in {key!r}; expected finite numbers, leave this frame out")
+        raise BadInput(f"{where}: NaN or infinity in {key!r}; leave this frame out {BY_OPTIONS}")
     return value
 
 
@@ -486,7 +487,7 @@ def checked(dataset: _Sequences, body: Body | None = None, samples: int = 3) -> 
 
 def _check_subject(dataset: _Sequences, name: str, samples: int, body: Body | None) -> dict[str, Any]:
     problems: list[str] = []
-    found: dict[str, Any] = {"subject": name, "problems": problems}
+    found: dict[str, Any] = {"subject": name, "problems": problems, "warnings": []}
     try:
         capture = dataset.open(name)
         model = capture.model if capture.standin else body

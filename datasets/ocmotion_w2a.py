@@ -43,6 +43,7 @@ from ihbench.datasets.pickles import write_pickle
 from ihbench.errors import BadInput
 from ihbench.files.pictures import encoded, one_line
 from ihbench.files.regular import read_text
+from ihbench.files.spelling import missing_file
 from ihbench.paths import user_path
 from ihbench.registry import nearest
 from ihbench.safe_pickle import load_pickle
@@ -142,7 +143,7 @@ class W2aCapture(OneCameraCapture):
         name = self.frame_names[frame]
         path = self.folder / "all_cameras.pkl"
         if not path.is_file():
-            raise BadInput(f"{path}: no such file; expected the cameras of the other views in it")
+            raise missing_file(path, "expected the cameras of the other views in it")
         entry, where = self._all_cameras[name], f"{path}: frame {name}"
         K = numbers(entry, "intrinsics", (-1, 3, 3), where)
         E = numbers(entry, "extrinsics", (len(K), 4, 4), where).copy()
@@ -291,7 +292,9 @@ def check(root: Path, body: Body | None = None, samples: int = 3) -> dict[str, A
         outside = len(capture._metadata) - capture.n_frames
         if outside and not capture.standin:
             subject["missing"]["image"] += outside
-            problems.append(f"{METADATA} has {outside} frames before or after the images; expected as many of both")
+            subject["warnings"].append(
+                f"{METADATA} has {outside} frames before or after the images; they are not used"
+            )
         if (capture.folder / "all_cameras.pkl").is_file() and subject["files"]["image"]:
             try:
                 capture.novel_cameras(0)

@@ -32,12 +32,13 @@ from ihbench import atomic
 from ihbench.body import Body
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera
-from ihbench.datasets.capture_folder import CaptureFolder
+from ihbench.datasets.capture_folder import BY_OPTIONS, CaptureFolder
 from ihbench.datasets.pickles import write_pickle
 from ihbench.datasets.plausibility import Outline, examine, share_inside
 from ihbench.errors import BadInput
 from ihbench.files import npz
 from ihbench.files.pictures import above_half, one_line
+from ihbench.files.spelling import missing_file
 from ihbench.paths import user_path
 from ihbench.registry import nearest
 from ihbench.safe_pickle import load_pickle
@@ -252,11 +253,11 @@ def video_path(folder: Path) -> Path:
     path = folder / f"{folder.name}.mp4"
     if path.is_file():
         return path
-    others = [other for other in sorted(folder.glob("*.mp4")) if not other.name.startswith(".")]
+    others = [other for other in sorted(folder.iterdir()) if other.suffix.lower() == ".mp4" and other.name[0] != "."]
     if len(others) == 1:
         return others[0]
     found = f"{len(others)} other .mp4 files, none of this name" if others else "no .mp4 file"
-    raise BadInput(f"{path}: no such file; expected the subject's video, found {found}; copy it here")
+    raise missing_file(path, f"expected the subject's video, found {found}; copy it here")
 
 
 # ---------------------------------------------------------------------------------------------- the files
@@ -268,7 +269,7 @@ def read_camera(path: Path) -> Camera:
     `camera_t` m and `camera_rt` rad (world to camera) are zeros in the release, and when they are missing.
     """
     if not path.is_file():
-        raise BadInput(f"{path}: no such file; expected the camera's parameters in it")
+        raise missing_file(path, "expected the camera's parameters in it")
     content = load_pickle(path)
     if not isinstance(content, dict):
         raise BadInput(f"{path}: expected a dictionary with camera_f, camera_c, …, found a {type(content).__name__}")
@@ -318,7 +319,7 @@ def finite_pose(path: Path, index: int, pose: NDArray, trans: NDArray, betas: ND
     """Row `index` of pose [M, 72] and trans [M, 3]. Raises `BadInput` when it holds NaN or infinity."""
     for name, value in (("pose", pose[index]), ("trans", trans[index]), ("betas", betas)):
         if not np.isfinite(value).all():
-            raise BadInput(f"{path}: NaN or infinity in the {name} of row {index}; leave this frame out")
+            raise BadInput(f"{path}: NaN or infinity in the {name} of row {index}; leave this frame out {BY_OPTIONS}")
     return BodyPose(pose[index].reshape(24, 3), betas, trans[index])
 
 
@@ -346,7 +347,7 @@ def read_npz(path: Path, wanted: dict[str, tuple[int | None, ...] | None]) -> di
     A name that ends in "?" may be missing. Raises `BadInput` for a damaged file, a missing name or another shape.
     """
     if not path.is_file():
-        raise BadInput(f"{path}: no such file; expected {', '.join(name.rstrip('?') for name in wanted)} in it")
+        raise missing_file(path, f"expected {', '.join(name.rstrip('?') for name in wanted)} in it")
     found = npz.read_npz(path)
     for name in wanted:
         if name.rstrip("?") not in found and not name.endswith("?"):
@@ -389,7 +390,7 @@ def _hdf5(path: Path) -> h5py.File:
     except ImportError:
         raise BadInput(f"{path}: reading HDF5 files needs the package h5py; run: pip install h5py") from None
     if not path.is_file():
-        raise BadInput(f"{path}: no such file; expected an HDF5 file of the PeopleSnapshot release")
+        raise missing_file(path, "expected an HDF5 file of the PeopleSnapshot release")
     try:
         return h5py.File(path, "r", locking=False, rdcc_nbytes=CHUNK_CACHE)  # locks fail on read-only network disks
     except (OSError, RuntimeError, ValueError) as error:
@@ -521,7 +522,7 @@ class Video:
         import cv2
 
         if not self.path.is_file():
-            raise BadInput(f"{self.path}: no such file; expected the subject's video")
+            raise missing_file(self.path, "expected the subject's video")
         try:
             stream = cv2.VideoCapture(str(self.path.absolute()), cv2.CAP_FFMPEG)
             opened = stream.isOpened()
@@ -557,7 +558,7 @@ def checked(dataset: Any, body: Body | None, inspect: Callable[[Any, dict[str, A
     subjects = []
     for name in dataset.subjects():
         problems: list[str] = []
-        found: dict[str, Any] = {"subject": name, "problems": problems}
+        found: dict[str, Any] = {"subject": name, "problems": problems, "warnings": []}
         subjects.append(found)
         try:
             capture = dataset.open(name, body)
@@ -605,7 +606,8 @@ def spoiled_rows(*arrays: NDArray) -> list[int]:
 def spelled_rows(path: Path, rows: list[int]) -> str:
     """The problem "NaN in these rows", with the first few named."""
     named = ", ".join(str(row) for row in rows[:5]) + (", …" if len(rows) > 5 else "")
-    return f"{path}: NaN or infinity in {len(rows)} row{'s' if len(rows) > 1 else ''} ({named}); leave these out"
+    several = "s" * (len(rows) > 1)
+    return f"{path}: NaN or infinity in {len(rows)} row{several} ({named}); leave these out {BY_OPTIONS}"
 
 
 def _inspect(capture: PeopleSnapshotCapture, samples: int, found: dict[str, Any]) -> None:
@@ -613,13 +615,11 @@ def _inspect(capture: PeopleSnapshotCapture, samples: int, found: dict[str, Any]
     counts = {"video": capture.video.n_frames, "masks": capture.n_masks, "poses": capture.n_poses}
     found["files"] = dict(counts)
     found["missing"] = {name: max(0, capture.n_masks - counts[name]) for name in ("video", "poses")}
-    if counts["video"] < capture.n_masks:
-        problems.append(
-            f"{capture.video.path}: {counts['video']} frames, but there are {capture.n_masks} masks; "
-            f"expected a frame for each mask, copy the video again"
+    if len(set(counts.values())) > 1:
+        found["warnings"].append(
+            f"{counts['video']} frames of video, {counts['masks']} masks, {counts['poses']} poses: what goes beyond "
+            f"the {capture.n_frames} that all have is not used; right if the same first frames were kept of each"
         )
-    if counts["poses"] < capture.n_masks:
-        problems.append(f"{capture.folder / POSES_FILE}: {counts['poses']} poses for {capture.n_masks} masks")
     shares = capture.alignment_shares
     found["alignment"] = {
         "chosen": capture.alignment,

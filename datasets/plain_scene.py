@@ -14,6 +14,7 @@ import hashlib
 import io
 import re
 import tempfile
+import unicodedata
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -34,6 +35,7 @@ from ihbench.datasets.standin_mark import STANDIN_FILE
 from ihbench.errors import BadInput
 from ihbench.files.npz import read_npz
 from ihbench.files.pictures import encoded, one_line, read_mask, read_rgb
+from ihbench.files.spelling import as_stored, missing_file, same_name
 from ihbench.paths import user_path
 from ihbench.registry import nearest
 from ihbench.scene import BodyPose
@@ -99,21 +101,32 @@ class PlainScene:
 
 
 class PlainCapture(CaptureFolder):
-    """One scene, read lazily; see `ihbench.scene.Capture`. Frames are the rows of poses.npz, by frame number."""
+    """One scene, read lazily; see `ihbench.scene.Capture`.
+
+    Frames are the rows of poses.npz by frame number, but for rows whose number no image has (`without_image`).
+    """
 
     dataset = "custom"
     variant = "plain"
 
     def __init__(self, folder: Path, name: str, body: Body | None = None):
-        has_own_body = (folder / BODY_FILE).is_file()
+        has_own_body = as_stored(folder / BODY_FILE).is_file()
         root = folder if (folder / STANDIN_FILE).is_file() else folder.parent
         super().__init__(folder, name, None if has_own_body else body, root)
         self.about: str = read_about(folder)["about"]
-        self._cameras = read_cameras(folder / CAMERAS_FILE)
-        self._poses = read_poses(folder / POSES_FILE)
+        self._cameras = read_cameras(as_stored(folder / CAMERAS_FILE))
+        self._poses = read_poses(as_stored(folder / POSES_FILE))
         self.camera_ids = tuple(self._cameras)
-        self.n_frames = len(self._poses.frames)
         self._listings: dict[tuple[str, int], dict[int, list[Path]]] = {}
+        numbers = [int(number) for number in self._poses.frames]
+        self.n_frames = len(numbers)
+        pictured = {number for camera in range(len(self.camera_ids)) for number in self.files("images", camera)}
+        kept = [row for row, number in enumerate(numbers) if number in pictured]
+        if self.standin or not kept:  # a stand-in lacks images that were not asked for
+            kept = list(range(len(numbers)))
+        self.without_image = [number for number in numbers if number not in pictured]
+        self._poses = self._poses.rows(kept)
+        self.n_frames = len(kept)
         if has_own_body:
             self.body = "own"
             if body is not None and body.content_sha() != self.model.content_sha():
@@ -127,7 +140,7 @@ class PlainCapture(CaptureFolder):
         """body.npz where there is one, else as in other captures. Raises `BadInput`."""
         if self.body != "own":
             return super().model
-        path = self.folder / BODY_FILE
+        path = as_stored(self.folder / BODY_FILE)
         try:
             return replace(load_body(path), name="own")
         except (zlib.error, NotImplementedError, RuntimeError) as error:
@@ -191,8 +204,8 @@ class PlainCapture(CaptureFolder):
 
     def picture_folder(self, kind: str, camera: int) -> Path:
         """Where a camera's files of a kind ("images", "masks") lie: a lone camera needs no folder of its own."""
-        folder = self.folder / kind
-        own = folder / self.camera_ids[camera]
+        folder = as_stored(self.folder / kind)
+        own = as_stored(folder / self.camera_ids[camera])
         return own if len(self.camera_ids) > 1 or own.is_dir() else folder
 
     def files(self, kind: str, camera: int) -> dict[int, list[Path]]:
@@ -229,7 +242,7 @@ class PlainCapture(CaptureFolder):
 
 
 def _is_scene(folder: Path) -> bool:
-    return (folder / CAMERAS_FILE).is_file() or (folder / POSES_FILE).is_file()
+    return any(as_stored(folder / name).is_file() for name in (CAMERAS_FILE, POSES_FILE))
 
 
 def _pictures(folder: Path, endings: Sequence[str]) -> list[Path]:
@@ -244,11 +257,11 @@ def _is_number(stem: str) -> bool:
 
 def read_about(folder: Path) -> dict[str, str]:
     """{"name", "about"} of scene.json; the folder's name and "" where it says nothing. Raises `BadInput`."""
-    path = folder / SCENE_FILE
+    path = as_stored(folder / SCENE_FILE)
     content = atomic.read_json(path) if path.is_file() else {}
     if not isinstance(content, dict) or not all(isinstance(content.get(key, ""), str) for key in ("name", "about")):
         raise BadInput(f'{path}: expected {{"name": text, "about": text}}, found other contents')
-    name = content.get("name", folder.absolute().name)
+    name = unicodedata.normalize("NFC", content.get("name", folder.absolute().name))
     if not re.fullmatch(r"[^/\\\x00-\x1f.][^/\\\x00-\x1f]{0,79}", name):
         raise BadInput(f"{path}: name {name!r}: expected 1 to 80 characters, no slash, no dot in front; rename it")
     return {"name": name, "about": content.get("about", "")}
@@ -260,7 +273,7 @@ def read_about(folder: Path) -> dict[str, str]:
 def read_cameras(path: Path) -> dict[str, Camera]:
     """The views by camera id, in the file's order. Raises `BadInput` naming the camera and key that is wrong."""
     if not path.is_file():
-        raise BadInput(f"{path}: no such file; expected the K, R, t, width and height of every camera in it")
+        raise missing_file(path, "expected the K, R, t, width and height of every camera in it")
     content = atomic.read_json(path)
     cameras = content.get("cameras") if isinstance(content, dict) else None
     if not isinstance(cameras, dict) or not cameras:
@@ -335,6 +348,12 @@ class Poses:
     betas: Array  # [N, B]
     transl: Array  # [N, 3] m
     root: str  # "smpl", or "zju": pose[:, 0] and transl are ZJU-MoCap's Rh and Th
+    numbered: bool  # the file says the numbers; else they count from 0
+
+    def rows(self, kept: list[int]) -> Poses:
+        """Some of the rows."""
+        frames, pose, betas, transl = (a[kept] for a in (self.frames, self.pose, self.betas, self.transl))
+        return replace(self, frames=frames, pose=pose, betas=betas, transl=transl)
 
     def row(self, frame: int) -> BodyPose:
         """One frame as stored, whatever the root."""
@@ -366,7 +385,9 @@ def read_poses(path: Path) -> Poses:
     frames = _frame_numbers(arrays.get("frames"), n, path)
     order = np.argsort(frames)
     betas = np.broadcast_to(betas, (n, betas.shape[1]))
-    return Poses(frames[order], pose.reshape(n, 24, 3)[order], betas[order], transl[order], str(root))
+    return Poses(
+        frames[order], pose.reshape(n, 24, 3)[order], betas[order], transl[order], str(root), "frames" in arrays
+    )
 
 
 def _frame_numbers(frames: NDArray | None, n: int, path: Path) -> NDArray[np.int64]:
@@ -391,13 +412,16 @@ def _floats(arrays: dict[str, NDArray], key: str, path: Path) -> Array:
     bad = np.argwhere(~np.isfinite(value))
     if len(bad):
         row = f" in row {bad[0][0]}" if value.ndim else ""
-        raise BadInput(f"{path}: {key}: NaN or infinity{row}; expected finite numbers, leave such frames out")
+        raise BadInput(
+            f"{path}: {key}: NaN or infinity{row}; expected finite numbers; leave "
+            f"such rows out and write the frame numbers of the others as 'frames'"
+        )
     return value.astype(np.float64)
 
 
 def _read_npz(path: Path) -> dict[str, NDArray]:
     if not path.is_file():
-        raise BadInput(f"{path}: no such file; expected the poses of every frame in it")
+        raise missing_file(path, "expected the poses of every frame in it")
     arrays = read_npz(path, largest=LARGEST_POSES)
     for key in arrays:
         if key not in POSE_KEYS:
@@ -433,7 +457,7 @@ def check(root: Path, samples: int = 3, body: Body | None = None) -> dict[str, A
 
 def _check_subject(dataset: PlainScene, name: str, samples: int, body: Body | None) -> dict[str, Any]:
     problems: list[str] = []
-    found: dict[str, Any] = {"subject": name, "problems": problems}
+    found: dict[str, Any] = {"subject": name, "problems": problems, "warnings": []}
     try:
         capture = dataset.open(name)
         if body is not None and capture.body == body.name:
@@ -467,6 +491,7 @@ def _check_subject(dataset: PlainScene, name: str, samples: int, body: Body | No
 
 
 def _check_files(capture: PlainCapture, found: dict[str, Any], problems: list[str]) -> None:
+    _check_numbers(capture, found, problems)
     posed = {capture.number(frame) for frame in range(capture.n_frames)}
     counts = {"image": 0, "mask": 0}
     missing = {"image": 0, "mask": 0, "pose": 0}
@@ -475,15 +500,21 @@ def _check_files(capture: PlainCapture, found: dict[str, Any], problems: list[st
         here = "" if len(capture.camera_ids) == 1 else f" of camera {name!r}"
         counts["image"] += len(images)
         counts["mask"] += len(masks)
+        missing["pose"] += len(images.keys() - posed)
+        if poseless := images.keys() - posed:
+            what = f"{len(poseless)} images{here} have no pose in {POSES_FILE} and are not used"
+            found["warnings"].append(f"{what}; the first is frame {min(poseless)}")
         lacks = {
-            "pose": (images.keys() - posed, f"images{here} have no pose in {POSES_FILE}"),
             "image": (posed - images.keys(), f"poses have no image{here}"),
             "mask": (images.keys() & posed - masks.keys(), f"images{here} have no mask"),
         }
         for what, (numbers, text) in lacks.items():
             missing[what] += len(numbers)
             if numbers and not (capture.standin and what == "image"):
-                problems.append(f"{len(numbers)} {text}; the first is frame {min(numbers)}")
+                problems.append(
+                    f"{len(numbers)} {text}; the first is frame {min(numbers)}: copy the files, or leave "
+                    f"these frames out of {POSES_FILE}"
+                )
         for listing in (images, masks):
             for number, paths in listing.items():
                 if len(paths) > 1:
@@ -500,12 +531,35 @@ def _check_files(capture: PlainCapture, found: dict[str, Any], problems: list[st
                 problems.append(f"{odd[0]}: {len(odd)} such names are ignored; expected <frame number>.{ending}")
     found["files"], found["missing"] = counts, missing
     for kind in ("images", "masks"):
-        folder = capture.folder / kind
+        folder = as_stored(capture.folder / kind)
         if not folder.is_dir():
             problems.append(f"{folder}: no such folder")
         elif len(capture.camera_ids) > 1:
-            strays = sorted(f.name for f in folder.iterdir() if f.is_dir() and f.name not in capture.camera_ids)
+            known = {same_name(name) for name in capture.camera_ids}
+            strays = sorted(f.name for f in folder.iterdir() if f.is_dir() and same_name(f.name) not in known)
             problems += [f"{folder / stray}: {CAMERAS_FILE} has no camera of this name" for stray in strays]
+
+
+def _check_numbers(capture: PlainCapture, found: dict[str, Any], problems: list[str]) -> None:
+    """Whether the rows of poses.npz and the files of the images count the same frames."""
+    pictured = sorted(
+        {number for camera in range(len(capture.camera_ids)) for number in capture.files("images", camera)}
+    )
+    rows = sorted({*capture.without_image, *(capture.number(frame) for frame in range(capture.n_frames))})
+    if not pictured or pictured == rows or capture.standin:
+        return
+    if not set(pictured) & set(rows) or (not capture._poses.numbered and len(pictured) == len(rows)):
+        without = "" if capture._poses.numbered else ", since it has no array 'frames'"
+        problems.append(
+            f"{capture.folder / POSES_FILE}: its {len(rows)} rows are of frames {rows[0]} to {rows[-1]}{without}, "
+            f"but the {len(pictured)} images are numbered {pictured[0]} to {pictured[-1]}; write the image's number "
+            f"of each row as 'frames'"
+        )
+    elif capture.without_image:
+        found["warnings"].append(
+            f"{len(capture.without_image)} poses have no image and are not used; the first is frame "
+            f"{capture.without_image[0]}"
+        )
 
 
 def _outlines(capture: PlainCapture, found: dict[str, Any]) -> tuple[Callable[[int], Outline], bool]:

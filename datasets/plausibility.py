@@ -152,7 +152,7 @@ def examine(
 
     Adds "sampled_images", "image_size" and, with an outline, "vertices_in_mask" and "mask_on_body" to `found`.
     """
-    report = Report(found["problems"], found.setdefault("warnings", []))
+    report = Report(found["problems"], found["warnings"])
     _check_poses(capture, report)
     usable = _check_cameras(capture, report)
     posed: dict[int, Outline] = {}

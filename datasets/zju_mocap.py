@@ -26,11 +26,12 @@ from numpy.typing import NDArray
 from ihbench import atomic
 from ihbench.body import Body, from_zju_root, zju_root
 from ihbench.camera import Camera
-from ihbench.datasets.capture_folder import CaptureFolder
+from ihbench.datasets.capture_folder import BY_OPTIONS, CaptureFolder
 from ihbench.datasets.pickles import write_object
 from ihbench.datasets.plausibility import Outline, examine
 from ihbench.errors import BadInput
 from ihbench.files.pictures import encoded, read_mask, read_rgb, size_of
+from ihbench.files.spelling import missing_file
 from ihbench.paths import user_path
 from ihbench.registry import nearest
 from ihbench.safe_pickle import load_npy
@@ -131,7 +132,7 @@ class ZjuCapture(CaptureFolder):
         assert self.fit is not None
         path = self.folder / vertex_folder(self.fit) / f"{self.number(frame)}.npy"
         if not path.is_file():
-            raise BadInput(f"{path}: no such file; expected the body's vertices at frame {frame}")
+            raise missing_file(path, f"expected the body's vertices at frame {frame}")
         vertices = load_npy(path)
         if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.dtype.kind != "f":
             raise BadInput(f"{path}: expected numbers of shape [V, 3] in metres, found {_shape_of(vertices)}")
@@ -210,7 +211,7 @@ class ZjuCapture(CaptureFolder):
     def _read_picture(self, path: Path, read: Callable[[Path], NDArray]) -> NDArray:
         if not path.is_file():
             missing = "file" if path.parent.is_dir() else f"file, nor its folder {path.parent.name}"
-            raise BadInput(f"{path}: no such {missing}; annots.npy lists it{self.standin_hint}")
+            raise missing_file(path, f"annots.npy lists it{self.standin_hint}", f"no such {missing}")
         return read(path)
 
     def _check_size(self, path: Path, picture: NDArray, camera: int) -> None:
@@ -239,7 +240,7 @@ class Annots:
 def read_annots(path: Path) -> Annots:
     """Cameras and image paths of one subject. Raises `BadInput` naming the field that is not as expected."""
     if not path.is_file():
-        raise BadInput(f"{path}: no such file; expected the cameras and image paths of this subject in it")
+        raise missing_file(path, "expected this subject's cameras and image paths")
     content = load_npy(path)
     content = content.item() if content.shape == () and content.dtype == object else None
     if not isinstance(content, dict) or not {"cams", "ims"} <= content.keys():
@@ -314,7 +315,7 @@ def _image_paths(ims: Any, n_cameras: int, path: Path) -> list[tuple[str, ...]]:
 def read_params(path: Path) -> tuple[NDArray[np.float64], ...]:
     """(poses [72 or 69], shapes [B], Rh [3] rad, Th [3] m) of one parameter file. Raises `BadInput`."""
     if not path.is_file():
-        raise BadInput(f"{path}: no such file; expected the frame's poses, shapes, Rh and Th")
+        raise missing_file(path, "expected the frame's poses, shapes, Rh and Th")
     content = load_npy(path)
     content = content.item() if content.shape == () and content.dtype == object else None
     sizes = {"poses": (72, 69), "shapes": (10, 300), "Rh": (3,), "Th": (3,)}
@@ -331,7 +332,7 @@ def read_params(path: Path) -> tuple[NDArray[np.float64], ...]:
                 f"{path}: expected {' or '.join(str(n) for n in allowed)} numbers in {key!r}, found {value.size}"
             )
         if not np.isfinite(value).all():
-            raise BadInput(f"{path}: NaN or infinity in {key!r}; expected finite numbers, leave this frame out")
+            raise BadInput(f"{path}: NaN or infinity in {key!r}; leave this frame out {BY_OPTIONS}")
         values.append(value)
     return tuple(values)
 
@@ -393,7 +394,7 @@ def check(dataset: ZjuMocap, layout: str, body: Body | None = None, samples: int
 
 def _check_subject(dataset: ZjuMocap, name: str, body: Body | None, samples: int) -> dict[str, Any]:
     problems: list[str] = []
-    found: dict[str, Any] = {"subject": name, "problems": problems}
+    found: dict[str, Any] = {"subject": name, "problems": problems, "warnings": []}
     try:
         capture = dataset.open(name)
         if body is not None and not capture.standin:

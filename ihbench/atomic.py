@@ -297,9 +297,11 @@ def _advice(path: Path) -> str:
 
 def _read_text(path: Path) -> str:
     try:
-        return read_bytes(path, "a JSON file").decode("utf-8")
+        return read_bytes(path, "a JSON file").decode("utf-8-sig")  # editors on Windows write a byte-order mark
     except UnicodeDecodeError as error:
-        raise BadInput(f"{path}: not UTF-8 text at byte {error.start}; expected a JSON file") from error
+        raise BadInput(
+            f"{path}: not UTF-8 text at byte {error.start}; expected a JSON file, save it as UTF-8"
+        ) from error
 
 
 def _parsed(path: Path, text: str, where: str = "") -> Any:

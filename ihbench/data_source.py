@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import unicodedata
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,12 +15,13 @@ from ihbench.errors import BadInput
 from ihbench.paths import path_from, users_cache
 from ihbench.progress import Progress
 from ihbench.protocol import Protocol
-from ihbench.scene import Capture
+from ihbench.scene import Capture, Dataset
 
 if TYPE_CHECKING:
     from ihbench.views import TestViewKey
 
 STANDIN_SEED = 0
+NEARBY = 200  # folders that are looked into for data that were not where they were said to be
 
 
 def cache_folder() -> Path:
@@ -34,17 +37,16 @@ def cache_folder() -> Path:
 
 def own_data(data: Path | None) -> Path | None:
     """The user's copy: `--data`, else `IHBENCH_DATA`, else None. Raises `BadInput` when it is not a folder."""
-    named = data or path_from("IHBENCH_DATA")
+    named = user_path(data, "data folder") if data is not None else path_from("IHBENCH_DATA")
     if named is not None and not named.is_dir():
-        raise BadInput(
-            f"data folder {named}: does not exist; give the folder of your copy with --data or IHBENCH_DATA"
-        )
+        state = "is a file" if named.is_file() else "does not exist"
+        raise BadInput(f"data folder {named}: {state}; give the folder of your copy with --data or IHBENCH_DATA")
     return named
 
 
 def own_body(body: Path | None) -> Path | None:
     """The user's SMPL file: `--body`, else `IHBENCH_BODY`, else None."""
-    return body or path_from("IHBENCH_BODY")
+    return user_path(body, "body file") if body is not None else path_from("IHBENCH_BODY")
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,36 @@ class DataSource:
             return False
 
 
+def open_dataset(name: str, root: Path) -> Dataset:
+    """A data set in a folder. Raises `BadInput` for a folder without it, naming one nearby that has it."""
+    try:
+        return registry.load("dataset", name)(root)
+    except BadInput as error:
+        other = folder_nearby(root, (name,))
+        if other is None or str(other) in str(error):
+            raise
+        raise BadInput(f"{error}; did you mean {other}?") from error
+
+
+def folder_nearby(root: Path, datasets: Iterable[str]) -> Path | None:
+    """The folder above or below that holds one of these data sets: one level too high or too low is soon given."""
+    here = root.absolute()
+    try:
+        below = [folder for pattern in ("*", "*/*") for folder in sorted(here.glob(pattern)) if folder.is_dir()]
+    except OSError:
+        below = []
+    for folder in (*below[:NEARBY], *list(here.parents)[:2]):
+        if folder.name.startswith((".", "__MACOSX")):
+            continue
+        for name in datasets:
+            try:
+                registry.load("dataset", name)(folder)
+            except BadInput:
+                continue
+            return folder
+    return None
+
+
 def locate(protocol: Protocol, data: Path | None, scenes: tuple[str, ...]) -> DataSource:
     """Find the data of a protocol. No `scenes` means all that the protocol names (of a user's copy: those present).
 
@@ -94,7 +126,8 @@ def locate(protocol: Protocol, data: Path | None, scenes: tuple[str, ...]) -> Da
     """
     root = own_data(data)
     if root is not None:
-        found = registry.load("dataset", protocol.dataset)(root).subjects()
+        found = open_dataset(protocol.dataset, root).subjects()
+        scenes = tuple(unicodedata.normalize("NFC", scene) if scene not in found else scene for scene in scenes)
         known = [s for s in protocol.subjects if s in found] or found
         return DataSource(protocol, root, False, _chosen(scenes, known, found, f"in {root}"))
     if protocol.dataset not in registry.names("stand-in"):
@@ -146,7 +179,7 @@ def body_file(named: Path, gender: str) -> Path:
     for wanted in (gender, "neutral"):
         for pattern in (f"smpl_{wanted}.", f"basicmodel_{wanted}_", f"basicmodel_{wanted[0]}_"):
             for path in sorted(named.iterdir()):
-                if path.name.lower().startswith(pattern) and path.suffix in (".pkl", ".npz"):
+                if path.name.lower().startswith(pattern) and path.suffix.lower() in (".pkl", ".npz"):
                     return path
     raise BadInput(f"{named}: no SMPL file for gender {gender!r} in it; expected SMPL_{gender.upper()}.pkl")
 

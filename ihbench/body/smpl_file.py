@@ -86,9 +86,9 @@ def find_model_file(folder: Path, gender: str = "neutral") -> Path:
 
 def read_arrays(path: Path) -> dict[str, Any]:
     """The entries of a model file that this bench uses, as plain arrays (and `name` as text). Shapes unchecked."""
-    if path.suffix == ".npz":
+    if path.suffix.lower() == ".npz":
         return _read_npz(path)
-    if path.suffix != ".pkl":
+    if path.suffix.lower() != ".pkl":
         raise BadInput(f"{path}: expected a body file that ends in .pkl or .npz; {WHERE_SMPL_IS}")
     raw = load_pickle(path)
     if not isinstance(raw, dict):

@@ -64,7 +64,7 @@ def main(argv: list[str]) -> int:
 def _check(chosen: Check) -> int:
     from ihbench.body import load_body
     from ihbench.data_check import add_fitness
-    from ihbench.data_source import body_file, own_body, own_data
+    from ihbench.data_source import body_file, folder_nearby, own_body, own_data
 
     folder = own_data(chosen.folder)
     assert folder is not None
@@ -80,7 +80,10 @@ def _check(chosen: Check) -> int:
         add_fitness(found, folder, body, chosen.overlays)
         print(json.dumps(found) if chosen.json else "\n".join(_lines(found)))
         return 0 if found["ok"] else 1
-    raise BadInput(f"data folder {chosen.folder}: no known layout ({'; '.join(complaints)})")
+    other = folder_nearby(folder, registry.names("dataset"))
+    if other is not None:
+        raise BadInput(f"data folder {folder}: no known layout; did you mean {other}?")
+    raise BadInput(f"data folder {folder}: no known layout ({'; '.join(complaints)})")
 
 
 def _lines(value: Any, indent: str = "") -> Iterator[str]:

@@ -1,6 +1,7 @@
 """The commands beside `run`: plan, report, export, data, and what they say about a finished run."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -280,6 +281,19 @@ def test_data_check_does_without_a_picture_where_none_may_be_written(bench, tmp_
         outcome = bench("data", "check", named)
         assert (outcome.status, outcome.out) == (2, "")
         assert len(outcome.err.splitlines()) == 1
+
+
+def test_data_check_names_the_folder_that_was_meant(bench, tmp_path):
+    with bench.in_its_world():
+        copy = shutil.copytree(standin_root("zju_mocap"), tmp_path / "data" / "copy")
+    for named in (tmp_path / "data", tmp_path, copy / "CoreView_standin-2" / "Camera_B1"):
+        outcome = bench("data", "check", named)
+        assert (outcome.status, outcome.out) == (2, "")
+        (meant,) = re.findall(r"did you mean (.+)\?$", outcome.err.strip())
+        assert bench("data", "check", meant, "--overlays", tmp_path / "seen").status == 0
+        outcome = bench("plan", "--protocol", bench.protocol, "--data", named)
+        assert outcome.status == 2
+        assert f"did you mean {meant}?" in outcome.err or f"in {meant}, give that folder" in outcome.err
 
 
 def test_data_check_of_a_folder_without_a_known_layout(bench, tmp_path):

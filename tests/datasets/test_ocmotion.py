@@ -528,7 +528,7 @@ def test_metadata_without_image(sequence):
     assert opened(sequence).n_frames == N_FRAMES - 1
     (subject,) = ocmotion_w2a.check(sequence.parent)["subjects"]
     assert subject["missing"]["image"] == 1
-    assert any("metadata.json has 1 frames before or after the images" in problem for problem in subject["problems"])
+    assert any("metadata.json has 1 frames before or after the images" in line for line in subject["warnings"])
     (sequence / "images" / "00321.png").unlink()
     with pytest.raises(BadInput, match=r"images/00321.png: no such file, one of 1 that metadata.json has within"):
         opened(sequence)

@@ -526,14 +526,14 @@ def test_video_shorter_than_the_masks(tmp_path, scene):
     write_raw(tmp_path / SUBJECT, scene, n_video=5)
     assert PeopleSnapshotRaw(tmp_path).open(SUBJECT).n_frames == 5
     report = PeopleSnapshotRaw.check(tmp_path)
-    assert "5 frames, but there are 8 masks" in problems(report)
+    assert "5 frames of video, 8 masks" in report["subjects"][0]["warnings"][0]
     assert report["subjects"][0]["missing"] == {"video": 3, "poses": 0}
 
 
 def test_fewer_poses_than_masks(raw, scene):
     people_snapshot.write_poses(raw, scene.poses[:6])
     assert PeopleSnapshotRaw(raw).open(SUBJECT).n_frames == 6
-    assert "6 poses for 8 masks" in problems(PeopleSnapshotRaw.check(raw))
+    assert "8 masks, 6 poses" in PeopleSnapshotRaw.check(raw)["subjects"][0]["warnings"][0]
 
 
 def test_video_of_another_size(raw, scene):
@@ -985,7 +985,7 @@ def test_images_that_are_missing(instant, scene):
     assert InstantAvatar(instant).open(SUBJECT).n_frames == N
     assert problems(InstantAvatar.check(instant)) == ""
     instantavatar.write_frame(instant, 9, scene.images[0], scene.masks[0])
-    assert "1 images have no pose" in problems(InstantAvatar.check(instant))
+    assert "1 images have no pose" in InstantAvatar.check(instant)["subjects"][0]["warnings"][0]
     shutil.rmtree(instant / "images")
     with pytest.raises(BadInput, match=r"no image_NNNN.png"):
         InstantAvatar(instant).open(SUBJECT)
@@ -1181,3 +1181,19 @@ def test_folder_that_holds_several_layouts_is_the_released_one(raw, written):
         for other in (InstantAvatar, GaussianAvatar):
             with pytest.raises(BadInput, match="no subject of this layout"):
                 other(raw)
+
+
+def test_an_upper_case_ending_of_the_video_is_read(raw):
+    (raw / f"{SUBJECT}.mp4").rename(raw / f"{SUBJECT}.MP4")
+    assert PeopleSnapshotRaw(raw).open(SUBJECT).n_frames == N
+
+
+def test_a_file_of_another_spelling_is_named(instant, gaussian):
+    (instant / "images/image_0001.png").rename(instant / "images/image_0001.PNG")
+    capture = GaussianAvatar(gaussian).open(SUBJECT)
+    path = capture.mask_path(capture.frames[0])
+    path.rename(path.with_suffix(".PNG"))
+    with pytest.raises(BadInput, match=r"there is 'image_0001.PNG', rename it to 'image_0001.png'"):
+        InstantAvatar(instant).open(SUBJECT).image(0, 1)
+    with pytest.raises(BadInput, match=rf"there is '{path.stem}.PNG', rename it to '{path.name}'"):
+        capture.silhouette(0, capture.frames[0])

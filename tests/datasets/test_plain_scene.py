@@ -571,11 +571,13 @@ def test_check_names_missing_files(copy):
     (copy / "images/right/000010.png").unlink()
     plain_scene.write_frame(copy, 77, np.zeros((HEIGHT, WIDTH, 3), np.uint8), camera_id="left")
     (subject,) = plain_scene.check(copy)["subjects"]
+    what_to_do = "copy the files, or leave these frames out of poses.npz"
     assert subject["problems"] == [
-        "1 images of camera 'left' have no pose in poses.npz; the first is frame 77",
-        "1 images of camera 'left' have no mask; the first is frame 4",
-        "1 poses have no image of camera 'right'; the first is frame 10",
+        f"1 images of camera 'left' have no mask; the first is frame 4: {what_to_do}",
+        f"1 poses have no image of camera 'right'; the first is frame 10: {what_to_do}",
     ]
+    pose_less = "1 images of camera 'left' have no pose in poses.npz and are not used; the first is frame 77"
+    assert subject["warnings"] == [pose_less]
     assert subject["missing"] == {"image": 1, "mask": 1, "pose": 1}
 
 
@@ -591,6 +593,112 @@ def test_check_names_files_it_does_not_understand(copy):
     assert any("lift: cameras.json has no camera of this name" in problem for problem in problems)
     with pytest.raises(BadInput, match=r"000003\.png and 3\.png are both frame 3"):
         PlainScene(copy).open("dance").image(0, 0)
+
+
+def renamed(pattern, name):
+    def change(folder):
+        for path in sorted(folder.rglob(pattern)):
+            path.rename(path.with_name(name(path.name)))
+
+    return change
+
+
+def with_mark(folder):
+    for path in (folder / "cameras.json", folder / "scene.json"):
+        text = path.read_text() if path.is_file() else '{"about": "a\\u0301"}'
+        path.write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
+
+
+def with_litter(folder):
+    for place in (folder, folder / "images" / "left", folder / "masks" / "left", folder / "images"):
+        for name in (".DS_Store", "Thumbs.db", "desktop.ini", "._000003.png", "._cameras.json", "000003.png~"):
+            (place / name).write_bytes(b"\0\5\x16\7")
+    (folder / "__MACOSX").mkdir()
+
+
+def linked(folder):
+    for path in sorted(folder.rglob("*.png")):
+        path.rename(path.with_suffix(".real"))
+        path.symlink_to(path.with_suffix(".real").name)
+
+
+def accented(folder):
+    """As macOS stores the names of what a JSON file writes in another form."""
+    change_json(
+        folder / "cameras.json", lambda _, all: all["cameras"].update({"l\u00e9ft": all["cameras"].pop("left")})
+    )
+    for kind in ("images", "masks"):
+        (folder / kind / "left").rename(folder / kind / "le\u0301ft")
+
+
+QUIRKS = {
+    "upper-case endings": renamed("*.png", lambda name: name.replace(".png", ".PNG")),
+    "mixed endings": renamed("*3.png", lambda name: name.replace(".png", ".Png")),
+    "upper-case JSON": renamed("*.json", str.upper),
+    "upper-case NPZ": renamed("*.npz", lambda name: name.replace(".npz", ".NPZ")),
+    "capital folders": renamed("*s", str.capitalize),
+    "other padding": renamed("*.png", lambda name: f"{int(name[:6])}.png"),
+    "byte-order marks": with_mark,
+    "litter": with_litter,
+    "links": linked,
+    "accents": accented,
+}
+
+
+@pytest.mark.parametrize("name", QUIRKS)
+def test_what_other_systems_make_of_names_is_read(name, written, copy):
+    QUIRKS[name](copy)
+    found = plain_scene.check(f"{copy}/")
+    (subject,) = found["subjects"]
+    assert (subject["problems"], subject["warnings"]) == ([], [])
+    capture, before = PlainScene(copy).open("dance"), PlainScene(written[0]).open("dance")
+    camera = 1 if name == "accents" else 0  # it now is the last one
+    for frame in range(len(FRAMES)):
+        np.testing.assert_array_equal(capture.image(camera, frame), before.image(0, frame))
+        np.testing.assert_array_equal(capture.silhouette(camera, frame), before.silhouette(0, frame))
+
+
+def test_frames_left_out_as_the_page_tells(written, copy):
+    """By rows of poses.npz, by images, or both: what is left is a sound scene, frame for frame."""
+    arrays = dict(np.load(copy / "poses.npz"))
+    per_frame = ("frames", "pose", "betas", "transl")
+    spoiled = arrays | {"pose": np.where(arrays["frames"][:, None, None] == 4, np.nan, arrays["pose"])}
+    np.savez(copy / "poses.npz", **spoiled)
+    (problem,) = problems_of(copy)
+    assert "NaN or infinity in row 1" in problem
+    assert "leave such rows out and write the frame numbers of the others as 'frames'" in problem
+    np.savez(copy / "poses.npz", **{k: v[[0, 2]] if k in per_frame else v for k, v in spoiled.items()})
+    found = plain_scene.check(copy)
+    assert found["ok"]
+    assert found["subjects"][0]["warnings"] == [
+        f"1 images of camera {name!r} have no pose in poses.npz and are not used; the first is frame 4"
+        for name in NAMES
+    ]
+    np.savez(copy / "poses.npz", **arrays)
+    for path in copy.glob("images/*/000004.png"):
+        path.unlink()
+    found = plain_scene.check(copy)
+    assert found["ok"]
+    assert found["subjects"][0]["warnings"] == ["1 poses have no image and are not used; the first is frame 4"]
+    capture, before = PlainScene(copy).open("dance"), PlainScene(written[0]).open("dance")
+    assert [capture.number(frame) for frame in range(capture.n_frames)] == [3, 10]
+    np.testing.assert_array_equal(capture.body_pose(1).pose, before.body_pose(2).pose)
+    np.testing.assert_array_equal(capture.image(0, 1), before.image(0, 2))
+
+
+@pytest.mark.parametrize("numbers", [range(1, 4), range(0, 6, 2), range(100, 103)])
+def test_images_that_are_numbered_otherwise_than_poses(numbers, tmp_path, own_body):
+    """Rows count from 0 where nothing says otherwise; with as many images of other numbers that is a mistake."""
+    folder = tmp_path / "s"
+    write_scene(folder, own_body, cameras={"left": make_cameras()["left"]}, numbers=list(numbers))
+    arrays = dict(np.load(folder / "poses.npz"))
+    frames = arrays.pop("frames")
+    np.savez(folder / "poses.npz", **arrays)
+    problem = problems_of(folder)[0]
+    assert "its 3 rows are of frames 0 to 2, since it has no array 'frames', but the 3 images" in problem
+    assert f"numbered {numbers[0]} to {numbers[-1]}; write the image's number of each row as 'frames'" in problem
+    np.savez(folder / "poses.npz", frames=frames, **arrays)
+    assert problems_of(folder) == []
 
 
 def each_mask(folder, change):
