@@ -245,11 +245,9 @@ def _check_cameras(capture: CaptureFolder, report: Report) -> list[int]:
 
 
 def absurd_camera(view: Camera) -> str:
-    """What no camera can be, in one line; empty for others. Size, K and R only: what it sees is another question."""
+    """What no camera can be, in one line; empty for others. Size and K only: what it sees is another question."""
     side = max(view.width, view.height)
     focal = view.K[0, 0], view.K[1, 1]
-    if np.abs(view.R @ view.R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(view.R) < 0:
-        return "R is no rotation; expected R Rᵀ = 1 and a right-handed world"
     if not 0.2 <= focal[0] / focal[1] <= 5:
         return f"focal lengths {focal[0]:.4g} and {focal[1]:.4g} px; expected about the same in x and y"
     for length in focal:

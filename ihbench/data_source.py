@@ -92,8 +92,8 @@ def open_dataset(name: str, root: Path) -> Dataset:
     try:
         return registry.load("dataset", name)(root)
     except BadInput as error:
-        other = folder_nearby(root, (name,))
-        if other is None or str(other) in str(error):
+        other = None if "give that folder" in str(error) else folder_nearby(root, (name,))
+        if other is None:
             raise
         raise BadInput(f"{error}; did you mean {other}?") from error
 

@@ -293,7 +293,7 @@ def test_data_check_names_the_folder_that_was_meant(bench, tmp_path):
         assert bench("data", "check", meant, "--overlays", tmp_path / "seen").status == 0
         outcome = bench("plan", "--protocol", bench.protocol, "--data", named)
         assert outcome.status == 2
-        assert f"did you mean {meant}?" in outcome.err or f"in {meant}, give that folder" in outcome.err
+        assert f"did you mean {meant}?" in outcome.err or f"there is one in {meant}, give that folder" in outcome.err
 
 
 def test_data_check_of_a_folder_without_a_known_layout(bench, tmp_path):

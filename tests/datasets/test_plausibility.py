@@ -1,6 +1,5 @@
 """What no sound capture has is a problem, what few have is a warning, and the likeliest reason is in the line."""
 
-import dataclasses
 import json
 import shutil
 
@@ -256,5 +255,3 @@ def test_cameras(K, absurd, suspicious):
     assert absurd in absurd_camera(view)
     assert bool(absurd) == bool(absurd_camera(view))
     assert absurd or (suspicious in suspicious_camera(view) and bool(suspicious) == bool(suspicious_camera(view)))
-    for R in (np.diag([1.0, 1, -1]), 2 * np.eye(3)):
-        assert "R is no rotation" in absurd_camera(dataclasses.replace(view, R=R))
