@@ -12,7 +12,7 @@ from ihbench import registry
 from ihbench.body import Body, load_body
 from ihbench.bounds import LARGEST_CAST
 from ihbench.errors import BadInput
-from ihbench.paths import path_from, users_cache
+from ihbench.paths import path_from, user_path, users_cache
 from ihbench.progress import Progress
 from ihbench.protocol import Protocol
 from ihbench.scene import Capture, Dataset
