@@ -10,6 +10,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from ihbench import bounds
 from ihbench.cli import main
 from ihbench.errors import BadInput
 from ihbench.methods.inpainthuman.inpainting import (
@@ -26,16 +27,28 @@ from ihbench.methods.inpainthuman.inpainting.mini_weights import load_mini, save
 from ihbench.methods.inpainthuman.inpainting.train_mini import MiniTrainer, curve_of
 from ihbench.progress import Progress
 from ihbench.threads import one_torch_thread
+from tests.conftest import contents
 from tests.methods.tiny_diffusion import same, tiny_backbone, weights
 
 QUIET = Progress.silent()
-SMALL = MiniTraining(people=2, each=2, steps=4, batch=3)
 SIDE = 64  # px
+
+
+def without_bounds(patch: pytest.MonkeyPatch) -> None:
+    """Two people are fewer than anybody may ask for."""
+    for bound in (bounds.Within, bounds.MultipleOf):
+        patch.setattr(bound, "holds", lambda self, number: True)
+
+
+with pytest.MonkeyPatch.context() as patch:
+    without_bounds(patch)
+    SMALL = MiniTraining(people=2, each=2, steps=4, batch=3)
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     """Two people a page, tiny networks and crops."""
+    without_bounds(monkeypatch)
     monkeypatch.setattr(mini_model, "CHANNELS", (32, 32, 32))
     for module in (crop_album, train_mini, mini_validation):
         monkeypatch.setattr(module, "PAGE", 2)
@@ -252,6 +265,22 @@ def test_the_command_trains_validates_and_writes_a_card(tmp_path, capsys, monkey
     card = (tmp_path / "README.md").read_text()
     assert "--train.people 2" in card
     assert load_mini(tmp_path).name == "mini"
+
+
+@pytest.mark.parametrize("start", [False, True])
+def test_another_model_of_the_same_folders_is_not_written_over(tmp_path, capsys, album, start):
+    """Stable Diffusion has a `unet` too; and the backbone to start from is nobody's place to train in."""
+    out = tmp_path / "model"
+    if start:
+        save_mini(tiny_backbone(), out)
+    else:
+        (out / "unet").mkdir(parents=True)
+        (out / "unet" / "config.json").write_text('{"_class_name": "UNet2DConditionModel"}')
+    before = contents(out)
+    words = ["train-mini", "--out", str(out / "." if start else out), "--album", str(album), "--train.people", "2"]
+    assert main([*words, *(("--start", str(out)) if start else ())]) == 2
+    assert "folder" in capsys.readouterr().err
+    assert contents(out) == before
 
 
 def test_help_lists_the_commands_of_methods(capsys):
