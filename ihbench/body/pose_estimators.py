@@ -76,7 +76,7 @@ def from_camera_space(
     height: int,
     pixel_center: float = 0.5,  # where K puts the centre of the first pixel; OpenCV's calibration: 0.0
 ) -> tuple[Camera, BodyPose]:
-    """ROMP and BEV (cam_trans), WHAM and GVHMR ("incam"), TRAM: already a body before a pinhole camera.
+    """ROMP and BEV (cam_trans), WHAM ("incam"), TRAM, and GVHMR after `from_smplx`: a body before a pinhole camera.
 
     Their camera is the origin of the world here. Raises `BadInput`, also for a body behind the camera.
     """
@@ -103,7 +103,7 @@ def from_world(
     up: str = "y",  # the world axis against gravity: "y" or "z"
     pixel_center: float = 0.5,
 ) -> tuple[Camera, BodyPose]:
-    """WHAM and GVHMR ("global"), SLAHMR: a body in a gravity-aligned world, and the frame's camera in that world.
+    """WHAM ("global"), SLAHMR, and GVHMR after `from_smplx`: a body in a gravity-aligned world and the frame's camera.
 
     The world is kept as it is. Raises `BadInput`, also when image and body together stand along another axis than
     `up`: then the world was turned or flipped on the way. (Either of them alone may lie or look down.)
