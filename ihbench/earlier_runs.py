@@ -8,8 +8,8 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from ihbench.atomic import read_json
 from ihbench.errors import BadInput
+from ihbench.store import RunFolder
 
 
 @dataclass(frozen=True)
@@ -52,19 +52,17 @@ def _finished(
     runs: Path, method: str, protocol: str, profile: str, cpu: str
 ) -> Iterator[tuple[dict[str, Any], dict[str, Any], str]]:
     """`about`, ledger and code. A damaged record tells nothing about time and is passed over."""
-    wanted = (method, protocol, profile, cpu)
+    wanted = (method, protocol, profile, cpu, "done")
     for path in sorted(runs.glob("*/run.json")):
         try:
-            record = read_json(path)
-            identity = record["identity"]
-            own = (identity["method"], identity["protocol"], identity["profile"], record["machine"]["cpu"])
-            if record["status"] != "done" or own != wanted:
-                continue
-            about, ledger = record["about"], record["ledger"]
-            float(about["total_seconds"])
-            _planned_away(about)
-            for stage in ledger["stages"].values():
-                float(stage["seconds"])
-        except (BadInput, AttributeError, KeyError, TypeError, ValueError):
+            run = RunFolder.open(path.parent)
+        except BadInput:
             continue
-        yield about, ledger, str(identity.get("code"))
+        identity, about, ledger = run.identity, run.record["about"], run.record.get("ledger")
+        own = (*(identity[key] for key in ("method", "protocol", "profile")), _cpu(run.record), run.status)
+        if own == wanted and ledger is not None and "total_seconds" in about:
+            yield about, ledger, identity["code"]
+
+
+def _cpu(record: Mapping[str, Any]) -> str | None:
+    return (record.get("machine") or {}).get("cpu")

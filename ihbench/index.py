@@ -1,179 +1,360 @@
-"""A SQLite index over run folders, for queries. The folders are the truth; it is made again when they change."""
+"""What a folder of runs holds, read fast: `runs.sqlite` keeps what was read of each run folder until it changes.
+
+The folders are the truth. What the index lacks, or holds of a folder whose files have changed since, is read again;
+where it may not be written, everything is, with the same answer.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import os
-import secrets
+import re
 import sqlite3
-import stat
-from contextlib import closing
+import time
+import zlib
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-from ihbench import locks, removal
+from ihbench import __version__, removal
 from ihbench.errors import BadInput
-from ihbench.results import mean_rows
-from ihbench.store import KILLED, LOCK, RunFolder
+from ihbench.metrics import Mean
+from ihbench.results import RunResult, read_result, without_copies
+from ihbench.store import HASH_LENGTH, KILLED
 
 UNREADABLE = "unreadable"
-LARGEST_FILE = 256 * 2**20  # bytes; no honest record comes near
+FILTERS = ("protocol", "scene", "method", "profile", "seed", "status")
+FILES = ("run.json", "scores.jsonl", "calibration.jsonl", "curve.jsonl")  # and presets/
+OURS = 0x69686265  # the database's application_id
+FORMER = b"CREATE TABLE about (signature TEXT"  # in the first page of an index of version 0.1
+OUR_NAME = re.compile(f"__[0-9a-f]{{{HASH_LENGTH}}}$")  # of a run folder, even of one that has lost its record
+WAIT = 10.0  # s for another process that writes the index
+FRESH = 10**8  # ns; files that have changed within this time are read again: they may change within the same tick
 
 SCHEMA = """
-CREATE TABLE about (signature TEXT NOT NULL);
+CREATE TABLE about (made_by TEXT NOT NULL);
 CREATE TABLE runs (
-    id TEXT PRIMARY KEY,  -- the folder's name
-    protocol TEXT, scene TEXT, method TEXT, profile TEXT, seed INTEGER,
-    status TEXT NOT NULL, reason TEXT NOT NULL, created TEXT, path TEXT NOT NULL
-);
-CREATE TABLE scores (
-    run TEXT NOT NULL REFERENCES runs (id),
-    row TEXT NOT NULL,  -- the predictor: the method itself
-    identity TEXT NOT NULL,
-    value REAL,  -- mean over the test views; NULL when absent
-    n INTEGER NOT NULL,  -- views the mean runs over
-    reason TEXT NOT NULL,
-    PRIMARY KEY (run, row, identity)
+    folder BLOB PRIMARY KEY,  -- its name
+    signature TEXT NOT NULL,  -- of the files it was read from
+    protocol TEXT, scene TEXT, method TEXT, profile TEXT, seed INTEGER,  -- NULL when unreadable
+    status TEXT NOT NULL, reason TEXT NOT NULL, created TEXT,
+    proof INTEGER NOT NULL,  -- CRC-32 of the above
+    content BLOB  -- the run as JSON, compressed, NULL when unreadable
 );
 """
+COLUMNS = "folder, signature, protocol, scene, method, profile, seed, status, reason, created"
 
-FILTERS = ("protocol", "scene", "method", "profile", "seed", "status")
+
+@dataclass(frozen=True)
+class Entry:
+    """One run folder as the index knows it."""
+
+    folder: bytes
+    signature: str
+    protocol: str | None
+    scene: str | None
+    method: str | None
+    profile: str | None
+    seed: int | None
+    status: str
+    reason: str
+    created: str | None
+
+    @property
+    def name(self) -> str:
+        return os.fsdecode(self.folder)
+
+    @property
+    def columns(self) -> tuple[Any, ...]:
+        return tuple(vars(self).values())
+
+    @property
+    def proof(self) -> int:
+        return zlib.crc32(repr(self.columns).encode("utf-8", "replace"))
+
+    def matches(self, filters: Mapping[str, Any]) -> bool:
+        for name, wanted in filters.items():
+            value = getattr(self, name)
+            if value != wanted and not (
+                name == "protocol" and value is not None and value.partition("@")[0] == wanted
+            ):
+                return False
+        return True
 
 
 class Index:
-    """`runs.sqlite` in a folder of runs."""
+    """The runs in a folder of run folders."""
 
     def __init__(self, runs: Path) -> None:
         self.runs = Path(runs)
         self.file = self.runs / "runs.sqlite"
 
     def query(self, **filters: Any) -> list[dict[str, Any]]:
-        """Runs that match every filter, oldest first. A protocol matches with or without its @version.
+        """What the folders are, oldest first: id, path, protocol, scene, method, profile, seed, status ("unreadable"
+        for damaged ones), reason, created. A protocol matches with or without its @version.
 
-        Filters: protocol, scene, method, profile, seed, status ("unreadable" for damaged folders). Raises `BadInput`
-        when there is no folder of runs, `ValueError` for an unknown filter.
+        Raises `BadInput` when there is no folder of runs, `ValueError` for an unknown filter.
         """
-        where, values = _conditions({name: value for name, value in filters.items() if name != "status"})
-        rows = self._select(f"SELECT * FROM runs {where} ORDER BY created, id", values)
-        for row in rows:
-            if row["status"] == "running" and not locks.is_held(self.runs / row["path"] / LOCK):
-                row |= {"status": "interrupted", "reason": KILLED}  # no file changes when a process dies
-        return [row for row in rows if filters.get("status", row["status"]) == row["status"]]
+        entries, _ = self._entries(filters)
+        hidden = ("folder", "signature")
+        return [
+            {"id": _printable(entry.name), "path": entry.name}
+            | {name: value for name, value in vars(entry).items() if name not in hidden}
+            for entry in entries
+            if entry.matches(filters)
+        ]
 
-    def scores(self, **filters: Any) -> list[dict[str, Any]]:
-        """Mean scores of the runs that match, one row for each run, predictor and identity string."""
-        where, values = _conditions(filters)
-        return self._select(
-            f"SELECT scores.*, protocol, scene, method, profile, seed FROM scores JOIN runs ON runs.id = scores.run "
-            f"{where} ORDER BY created, id, row, identity",
-            values,
-        )
+    def results(self, **filters: Any) -> tuple[list[RunResult], list[str]]:
+        """The runs that match every filter, oldest first, and, one line each, the folders that are left out: damaged
+        ones, whatever they were, and copies of a run that is there. Raises as `query` does."""
+        entries, read = self._entries(filters)
+        matching = [entry for entry in entries if entry.status != UNREADABLE and entry.matches(filters)]
+        read |= self._stored_results([entry for entry in matching if entry.folder not in read])
+        results, left_out = without_copies([read[entry.folder] for entry in matching])
+        damaged = [f"{self.runs / entry.name}: {entry.reason}" for entry in entries if entry.status == UNREADABLE]
+        return results, [*damaged, *left_out]
 
-    def rebuild(self) -> int:
-        """Read every run folder again; how many there are. A damaged one is listed as unreadable with the reason."""
-        folders = self._folders()
-        temporary = self.runs / f".runs.sqlite.{secrets.token_hex(4)}.tmp"
-        try:
-            with closing(sqlite3.connect(temporary)) as database, database:
-                database.executescript(SCHEMA)
-                database.execute("INSERT INTO about VALUES (?)", (self._signature(folders),))
-                for folder in folders:
-                    run, scores = _read(folder)
-                    database.execute("INSERT INTO runs VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", run)
-                    database.executemany("INSERT INTO scores VALUES (?, ?, ?, ?, ?, ?)", scores)
-            os.replace(temporary, self.file)
-        except (OSError, sqlite3.OperationalError) as error:
-            raise BadInput(f"{self.file}: cannot be written ({error}); make room or check permissions") from error
-        finally:
-            removal.discard_file(temporary)
-        return len(folders)
+    # --- reading folders ---
 
-    def _select(self, statement: str, values: dict[str, Any]) -> list[dict[str, Any]]:
-        if not self._is_current():
-            self.rebuild()
-        with closing(sqlite3.connect(self.file)) as database:
-            database.row_factory = sqlite3.Row
-            return [dict(row) for row in database.execute(statement, values)]
+    def _entries(self, filters: Mapping[str, Any]) -> tuple[list[Entry], dict[bytes, RunResult]]:
+        """All folders, oldest first, and of those that were read now the results."""
+        unknown = sorted(set(filters) - set(FILTERS))
+        if unknown:
+            raise ValueError(f"index: expected filters among {', '.join(FILTERS)}, got {', '.join(unknown)}")
+        signatures = {os.fsencode(folder.name): signature(folder) for folder in self._folders()}
+        stored = {entry.folder: entry for entry in self._stored()}
+        entries, results = {}, {}
+        for name, signed in signatures.items():
+            if name in stored and stored[name].signature == signed:
+                entries[name] = stored[name]
+            else:
+                entries[name], result = _read(self.runs / os.fsdecode(name), signed)
+                if result is not None:
+                    results[name] = result
+        fresh = [entry for name, entry in entries.items() if entry is not stored.get(name)]
+        gone = [name for name in stored if name not in signatures]
+        if fresh or gone or not os.path.lexists(self.file):
+            self._store(fresh, gone, results)
+        return sorted(entries.values(), key=lambda entry: (entry.created or "", entry.folder)), results
 
-    def _is_current(self) -> bool:
-        if not self.file.is_file():
-            return False
-        try:
-            with closing(sqlite3.connect(self.file)) as database:
-                (stored,) = database.execute("SELECT signature FROM about").fetchone()
-        except (sqlite3.DatabaseError, TypeError):
-            return False
-        return stored == self._signature(self._folders())
-
-    def _folders(self) -> list[Path]:
+    def _folders(self) -> Iterator[Path]:
         """Folders that hold, or should hold, a run. Links are not followed."""
         try:
-            entries = sorted(os.scandir(self.runs), key=lambda entry: entry.name)
+            with os.scandir(self.runs) as entries:
+                folders = [Path(entry.path) for entry in entries if entry.is_dir(follow_symlinks=False)]
         except OSError as error:
             raise BadInput(f"{self.runs}: no folder of runs ({error.strerror}); give the --runs of a run") from error
-        folders = [Path(entry.path) for entry in entries if entry.is_dir(follow_symlinks=False)]
-        return [folder for folder in folders if os.path.lexists(folder / "run.json")]
+        return (f for f in folders if os.path.lexists(f / "run.json") or OUR_NAME.search(f.name))
 
-    def _signature(self, folders: list[Path]) -> str:
-        """Changes whenever a file the index was made from does."""
-        seen = hashlib.sha256(SCHEMA.encode())
-        for folder in folders:
-            for name in ("run.json", "scores.jsonl"):
-                try:
-                    about = os.lstat(folder / name)
-                except OSError:
-                    continue
-                seen.update(os.fsencode(folder / name))
-                seen.update(f"{about.st_mtime_ns} {about.st_size} {about.st_ino}\n".encode())
-        return seen.hexdigest()
+    # --- the database ---
+
+    def _stored(self) -> list[Entry]:
+        """What the database says that it can prove; nothing where there is none, or none of ours."""
+        with suppress(OSError, sqlite3.Error, OverflowError), closing(self._open("ro")) as database:
+            if not _is_current(database):
+                return []
+            rows = database.execute(f"SELECT {COLUMNS}, proof FROM runs").fetchall()
+            proven = [(_entry(row[:-1]), row[-1]) for row in rows]
+            return [entry for entry, proof in proven if entry is not None and entry.proof == proof]
+        return []
+
+    def _stored_results(self, entries: Iterable[Entry]) -> dict[bytes, RunResult]:
+        """The runs of entries that the database holds; what it has lost meanwhile is read from the folders."""
+        contents: dict[bytes, bytes] = {}
+        wanted = {entry.folder: entry for entry in entries}
+        with suppress(OSError, sqlite3.Error), closing(self._open("ro")) as database:
+            for name, entry in wanted.items():
+                row = database.execute(
+                    "SELECT content FROM runs WHERE folder = ? AND signature = ?", (name, entry.signature)
+                ).fetchone()
+                if row is not None:
+                    contents[name] = row[0]
+        return {
+            name: _unpacked(self.runs / entry.name, contents.get(name)) or read_result(self.runs / entry.name)
+            for name, entry in wanted.items()
+        }
+
+    def _store(self, fresh: Iterable[Entry], gone: Iterable[bytes], results: Mapping[bytes, RunResult]) -> None:
+        """Bring the database up to date, as far as it may be written. What another process has put there meanwhile
+        stays or is replaced: each line proves by its signature what it was read from."""
+        rows = []
+        for entry in fresh:
+            content = results.get(entry.folder)
+            rows.append((*entry.columns, entry.proof, None if content is None else _packed(content)))
+        for attempt in range(2):
+            try:
+                with closing(self._open("rwc")) as database, database:
+                    database.execute("BEGIN IMMEDIATE")
+                    if not _is_current(database):
+                        _make(database)
+                    marks = ", ".join("?" * (len(COLUMNS.split(",")) + 2))
+                    database.executemany(f"INSERT OR REPLACE INTO runs VALUES ({marks})", rows)
+                    database.executemany("DELETE FROM runs WHERE folder = ?", [(name,) for name in gone])
+                return
+            except sqlite3.DatabaseError as error:
+                if attempt or isinstance(error, sqlite3.OperationalError) or not self._is_broken():
+                    return
+                removal.discard_file(self.file)  # of ours, and damaged
+            except (OSError, OverflowError):
+                return
+
+    def _open(self, mode: str) -> sqlite3.Connection:
+        """The database in a file of our own; never one that a link or a pipe leads to. Raises `OSError`."""
+        if os.path.lexists(self.file) and (self.file.is_symlink() or not self.file.is_file()):
+            raise OSError(f"{self.file}: is no plain file")
+        if mode == "ro" and not self.file.exists():
+            raise FileNotFoundError(self.file)
+        database = sqlite3.connect(
+            f"{self.file.resolve().as_uri()}?mode={mode}", uri=True, timeout=WAIT, isolation_level=None
+        )
+        database.text_factory = lambda data: data.decode("utf-8", "replace")
+        database.execute("PRAGMA synchronous = OFF")  # after a power cut what is lost or damaged is read again
+        return database
+
+    def _is_broken(self) -> bool:
+        """Whether the file is a damaged index, and nothing of anybody else's."""
+        try:
+            with open(self.file, "rb") as file:
+                head = file.read(4096)
+        except OSError:
+            return False
+        own = head[:15] == b"SQLite format 3" and int.from_bytes(head[68:72], "big") == OURS
+        return own or FORMER in head
 
 
-def _conditions(filters: dict[str, Any]) -> tuple[str, dict[str, Any]]:
-    unknown = sorted(set(filters) - set(FILTERS))
-    if unknown:
-        raise ValueError(f"index: expected filters among {', '.join(FILTERS)}, got {', '.join(unknown)}")
-    parts = [
-        f"({name} = :{name} OR substr({name}, 1, length(:{name}) + 1) = :{name} || '@')"
-        if name == "protocol"
-        else f"{name} = :{name}"
-        for name in filters
-    ]
-    return ("WHERE " + " AND ".join(parts) if parts else ""), filters
+def signature(folder: Path) -> str:
+    """Changes whenever a file that a run is read from does."""
+    parts = []
+    newest = 0
+    names: list[str | Path] = [folder / name for name in FILES]
+    with suppress(OSError):
+        names += sorted(entry.path for entry in os.scandir(folder / "presets"))
+    for name in names:
+        try:
+            about = os.lstat(name)
+        except OSError:
+            parts.append("-")
+            continue
+        newest = max(newest, about.st_ctime_ns)
+        parts.append(f"{about.st_mode} {about.st_mtime_ns} {about.st_ctime_ns} {about.st_size} {about.st_ino}")
+    seen = "\n".join([*map(str, names[len(FILES) :]), *parts])
+    if abs(time.time_ns() - newest) < FRESH:
+        seen += f"\nread {time.time_ns()}"
+    return hashlib.sha256(seen.encode("utf-8", "replace")).hexdigest()
 
 
-def _read(folder: Path) -> tuple[tuple[Any, ...], list[tuple[Any, ...]]]:
-    """One row for `runs` and the rows for `scores`, whatever the folder holds."""
-    name = _text(folder.name)
+def _read(folder: Path, signed: str) -> tuple[Entry, RunResult | None]:
+    """A folder as an entry and, unless it is damaged, as a run."""
+    name = os.fsencode(folder.name)
     try:
-        for file in ("run.json", "scores.jsonl"):
-            _check_plain_file(folder / file)
-        run = RunFolder.open(folder)
-        parts = [run.identity[key] for key in ("protocol", "scene", "method", "profile")]
-        seed = run.identity["seed"]
-        if not all(isinstance(part, str) for part in parts) or not isinstance(seed, int) or abs(seed) >= 2**63:
-            raise BadInput("identity holds values of a wrong type")
-        scores = [
-            (name, _text(row), _text(identity), None if mean.absent else mean.value, mean.n, _text(mean.reason))
-            for row, means in mean_rows(run.scores()).items()
-            for identity, mean in means.items()
-        ]
-        about = run.status, _text(run.reason), _text(run.record["created"])
-        return (name, *map(_text, parts), seed, *about, name), scores
-    except Exception as error:  # a folder may hold anything; it must not take the others with it
-        reason = _text(f"{type(error).__name__}: {error}")
-        return (name, None, None, None, None, None, UNREADABLE, reason, None, name), []
+        result = read_result(folder)
+    except BadInput as error:
+        reason = str(error).removeprefix(f"{folder}/").removeprefix(f"{folder}: ")
+        return Entry(name, signed, None, None, None, None, None, UNREADABLE, _printable(reason), None), None
+    identity, record = result.identity, result.record
+    if result.status == "running" or record["reason"] == KILLED:
+        signed += " at that moment"  # no file changes when a process dies: to be read again
+    parts = [_printable(identity[key]) for key in ("protocol", "scene", "method", "profile")]
+    outcome = result.status, _printable(record["reason"]), record["created"]
+    return Entry(name, signed, *parts, identity["seed"], *outcome), result
 
 
-def _check_plain_file(file: Path) -> None:
-    """Raise `BadInput` for what must not be opened: links, pipes, devices, and files too large to be records."""
+def _entry(row: tuple[Any, ...]) -> Entry | None:
+    """A line of the database, or None for one that nobody here has written."""
+    folder, signed, *texts, seed, status, reason, created = row
+    may_be_null = [*texts, created]
+    if not isinstance(folder, bytes) or not all(isinstance(text, str) for text in (signed, status, reason)):
+        return None
+    if not all(text is None or isinstance(text, str) for text in may_be_null) or not isinstance(seed, int | None):
+        return None
+    return Entry(*row)
+
+
+def _made_by(database: sqlite3.Connection) -> str | None:
+    """What code wrote the database; "" for an empty one, None for one that is not ours."""
+    if not database.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
+        return ""
+    if database.execute("PRAGMA application_id").fetchone()[0] == OURS:
+        row = database.execute("SELECT made_by FROM about").fetchone()
+        return "" if row is None else str(row[0])
+    tables = {row[0] for row in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    columns = [row[1] for row in database.execute("PRAGMA table_info(about)")]
+    return "0.1" if tables == {"about", "runs", "scores"} and columns == ["signature"] else None
+
+
+def _is_current(database: sqlite3.Connection) -> bool:
+    columns = [row[1] for row in database.execute("PRAGMA table_info(runs)")]
+    return columns == [*COLUMNS.split(", "), "proof", "content"] and _made_by(database) == this_code()
+
+
+def _make(database: sqlite3.Connection) -> None:
+    """Begin anew inside a transaction. Raises `sqlite3.OperationalError` for a database that is not ours."""
+    if _made_by(database) is None:
+        raise sqlite3.OperationalError("not an index of this bench")
+    for table in ("about", "runs", "scores"):
+        database.execute(f"DROP TABLE IF EXISTS {table}")
+    for statement in SCHEMA.split(";")[:-1]:
+        database.execute(statement)
+    database.execute("INSERT INTO about VALUES (?)", (this_code(),))
+    database.execute(f"PRAGMA application_id = {OURS}")
+
+
+@cache
+def this_code() -> str:
+    """Changes with the code that reads run folders: what other code has read is read again."""
+    from ihbench import record, results, shape, store
+    from ihbench.metrics import aggregate, identity
+
+    digest = hashlib.sha256(f"{__version__}\n{SCHEMA}".encode())
+    for module in (record, results, shape, store, aggregate, identity):
+        with suppress(OSError, TypeError):
+            digest.update(Path(module.__file__).read_bytes())  # type: ignore[arg-type]
+    with suppress(OSError):
+        digest.update(Path(__file__).read_bytes())
+    return digest.hexdigest()
+
+
+def _packed(result: RunResult) -> bytes:
+    def means(rows: Mapping[str, Mapping[str, Mean]]) -> dict[str, Any]:
+        return {
+            row: {i: [m.value, m.reason, m.n, m.infinite, m.absent_count] for i, m in found.items()}
+            for row, found in rows.items()
+        }
+
+    content = {
+        "record": result.record,
+        "rows": means(result.rows),
+        "presets": {name: means(rows) for name, rows in result.presets.items()},
+        "curve": result.curve,
+        "damage": result.damage,
+    }
+    return zlib.compress(json.dumps(content).encode(), 1)
+
+
+def _unpacked(folder: Path, content: Any) -> RunResult | None:
+    """The inverse of `_packed`; None for what it cannot have made."""
+
+    def means(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Mean]]:
+        return {
+            row: {
+                identity: Mean(value, identity, reason, n, infinite, absent)
+                for identity, (value, reason, n, infinite, absent) in found.items()
+            }
+            for row, found in rows.items()
+        }
+
     try:
-        about = os.lstat(file)
-    except FileNotFoundError:
-        return
-    if not stat.S_ISREG(about.st_mode) or about.st_size > LARGEST_FILE:
-        raise BadInput(f"{file.name}: not a plain file, or larger than {LARGEST_FILE} bytes")
+        read = json.loads(zlib.decompress(content))
+        presets = {name: means(rows) for name, rows in read["presets"].items()}
+        return RunResult(folder, read["record"], means(read["rows"]), presets, read["curve"], tuple(read["damage"]))
+    except (zlib.error, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return None
 
 
-def _text(value: Any) -> str:
-    """Text that any database takes: undecodable file names and lone surrogates replaced, length bounded."""
-    return str(value)[:2000].encode("utf-8", "replace").decode()
+def _printable(value: str) -> str:
+    """Text that any database and terminal takes: undecodable names and lone surrogates replaced."""
+    return value[:2000].encode("utf-8", "replace").decode()

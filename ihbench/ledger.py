@@ -13,7 +13,7 @@ import time
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -345,16 +345,26 @@ def _row(path: str, stage: Stage, total: float) -> dict[str, Any]:
     return {"stage": path, "depth": path.count("/"), "share": share, **asdict(stage)}
 
 
-def in_order(paths: Mapping[str, Any], parent: str = "") -> Iterator[str]:
-    """Paths in the order they were first opened, each followed by what it contains."""
+def in_order(paths: Mapping[str, Any]) -> Iterator[str]:
+    """Paths in the order they were first opened, each followed by what it contains; one whose parent is not among
+    them comes where it stands."""
+    inside: dict[str, list[str]] = {}
     for path in paths:
-        if path.rpartition("/")[0] == parent:
-            yield path
-            yield from in_order(paths, path)
+        parent = path.rpartition("/")[0]
+        inside.setdefault(parent if parent in paths else "", []).append(path)
+    waiting = inside.get("", [])[::-1]
+    while waiting:
+        path = waiting.pop()
+        yield path
+        waiting += inside.get(path, [])[::-1]
 
 
 def _stages(record: Mapping[str, Any]) -> dict[str, Stage]:
-    return {path: Stage(**values) for path, values in record.items()}
+    """What an earlier version counted besides is dropped, what it did not count begins at 0."""
+    known = [field.name for field in fields(Stage)]
+    return {
+        path: Stage(**{name: values[name] for name in known if name in values}) for path, values in record.items()
+    }
 
 
 def _root(path: str) -> str:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ihbench.body import load_body
 from ihbench.capture_digest import capture_digest
 from ihbench.data_source import open_capture, own_body, own_data, standin_root
 from ihbench.errors import BadInput
 from ihbench.protocol import Protocol, load_protocol, protocol_from
+from ihbench.record import outcome_fault
 from ihbench.scene import Capture
 from ihbench.store import RunFolder
 from ihbench.views import OccludedScene, open_scene
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 def reopen_body(folder: Path, data: Path | None, body: Path | None) -> Body:
     """The body model of a run's poses. Raises `BadInput` when the run needs an SMPL file and none is named."""
-    about = RunFolder.open(folder).record["about"]
+    about = _record(folder)["about"]
     if about["standin"]:
         return load_body()
     if about.get("body") == "own":
@@ -35,7 +36,7 @@ def reopen_body(folder: Path, data: Path | None, body: Path | None) -> Body:
 
 def reopen_capture(folder: Path, data: Path | None, body: Path | None) -> Capture:
     """The capture of a run. Raises `BadInput` when other data lie where it is looked for."""
-    record = RunFolder.open(folder).record
+    record = _record(folder)
     about, identity = record["about"], record["identity"]
     root = own_data(data)
     if root is None and not about["standin"]:
@@ -79,3 +80,11 @@ def reopen_scene(folder: Path, data: Path | None, body: Path | None) -> tuple[Oc
             "run it again"
         )
     return scene, reopen_body(folder, data, body)
+
+
+def _record(folder: Path) -> dict[str, Any]:
+    """The record of a run that says what it was made on. Raises `BadInput` for one that does not."""
+    record = RunFolder.open(folder).record
+    if found := outcome_fault(record):
+        raise BadInput(f"{folder / 'run.json'}: {found}; run the same command with --force")
+    return record

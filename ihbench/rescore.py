@@ -16,6 +16,7 @@ from ihbench.errors import BadInput
 from ihbench.metrics.evaluate import Preset, find_preset
 from ihbench.predictions import read_image
 from ihbench.progress import Progress
+from ihbench.record import preset_lines
 from ihbench.reopen import reopen_protocol, reopen_scene
 from ihbench.results import view_rows
 from ihbench.score_stage import ScoreStage, render_path
@@ -62,7 +63,7 @@ def _stands(file: Path, preset: Preset, code: str) -> bool:
     """Whether the file would come out the same now: by this code, and without a metric that was absent then and can
     be computed now."""
     try:
-        head = atomic.read_json_lines(file)[0]
-        return head["code"] == code and set(head["lacking"]) <= set(preset.lacking())
-    except (BadInput, IndexError, KeyError, TypeError):
-        return False  # damaged, or of a version that did not say
+        head, _ = preset_lines(file)
+    except BadInput:  # damaged: the renders are there to be scored again
+        return False
+    return head.get("code") == code and set(head["lacking"]) <= set(preset.lacking())

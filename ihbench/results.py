@@ -3,29 +3,34 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+import os
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ihbench import atomic
 from ihbench.errors import BadInput
 from ihbench.metrics import Mean, Score, mean_over_frames
-from ihbench.scoring import ViewScores
+from ihbench.record import curve_points, outcome_fault, preset_lines, score_lines
 from ihbench.store import RunFolder
 
-NAMED_BY = {"protocol", "protocol_digest", "profile", "scene", "method", "seed", "code"}  # of the identity
+if TYPE_CHECKING:
+    from ihbench.scoring import ViewScores
+
+Rows = dict[str, dict[str, Mean]]  # row name -> identity -> mean over the scene's test views
 
 
 @dataclass(frozen=True)
 class RunResult:
-    """One run folder, read."""
+    """One run folder, read and checked: see `ihbench.record`."""
 
     folder: Path
     record: dict[str, Any]  # run.json
-    rows: dict[str, dict[str, Mean]]  # row name -> identity -> mean over the scene's test views
-    presets: dict[str, dict[str, dict[str, Mean]]] = field(default_factory=dict)  # preset scored later -> its rows
+    rows: Rows
+    presets: dict[str, Rows] = field(default_factory=dict)  # preset scored later -> its rows
+    curve: list[dict[str, Any]] = field(default_factory=list)  # points, see `RunFolder.add_curve_point`
+    damage: tuple[str, ...] = ()  # files that no number in `rows` comes from and that cannot be read, and why
 
     @property
     def status(self) -> str:
@@ -60,16 +65,6 @@ class RunResult:
         """Test views without an image, over which the means do not run: of predictions whose files were missing."""
         return len(self.record["about"].get("predictions", {}).get("missing", ()))
 
-    @cached_property
-    def curve(self) -> list[dict[str, Any]]:
-        """Quality-time points, see `RunFolder.add_curve_point`; none where there is no file, or a damaged one."""
-        file = self.folder / "curve.jsonl"
-        try:
-            points = atomic.read_json_lines(file) if file.is_file() else []
-            return [point for point in points if float(point["seconds"]) >= 0 and isinstance(point["scores"], dict)]
-        except (BadInput, KeyError, TypeError, ValueError):
-            return []
-
     @property
     def data(self) -> str:
         """What the run was made on, as a table names it."""
@@ -98,7 +93,7 @@ def view_rows(row: str, scores: Iterable[ViewScores]) -> list[dict[str, Any]]:
     ]
 
 
-def mean_rows(lines: Iterable[dict[str, Any]]) -> dict[str, dict[str, Mean]]:
+def mean_rows(lines: Iterable[dict[str, Any]]) -> Rows:
     """The inverse of `view_rows` up to the mean over views: row -> identity -> mean."""
     scores: dict[str, dict[str, list[Score]]] = {}
     for line in lines:
@@ -113,29 +108,101 @@ def mean_rows(lines: Iterable[dict[str, Any]]) -> dict[str, dict[str, Mean]]:
 
 
 def read_result(folder: Path) -> RunResult:
-    """Read a run folder. Raises `BadInput` when it is none or is damaged."""
+    """Read a run folder. Raises `BadInput` when it is none, or a file that its numbers come from is damaged."""
     run = RunFolder.open(folder)
     run.notice_death()
     record = run.record
-    if not record["identity"].keys() >= NAMED_BY or not record["about"].keys() >= {"standin", "variant"}:
-        raise BadInput(f"{folder}: run.json is not a run record of this bench")
-    lines: list[dict[str, Any]] = []
-    for name in ("scores.jsonl", "calibration.jsonl"):
-        if (folder / name).is_file():
-            lines += atomic.read_json_lines(folder / name)
-    try:
-        rows = mean_rows(lines)
-        presets = {
-            file.stem: mean_rows(atomic.read_json_lines(file)[1:])
-            for file in sorted((folder / "presets").glob("*.jsonl"))
-        }
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise BadInput(
-            f"{folder}: its score files are damaged ({error}); run the same command with --force"
-        ) from error
-    if record["status"] == "done" and record["identity"]["method"] not in rows:
+    if found := outcome_fault(record):
+        raise BadInput(f"{folder / 'run.json'}: {found}; run the same command with --force")
+    method = record["identity"]["method"]
+    own, others = (_read_if_there(folder / name, score_lines) for name in ("scores.jsonl", "calibration.jsonl"))
+    if found := _mixed_up(method, own, others):
+        raise BadInput(f"{folder}: its score files are damaged ({found}); run the same command with --force")
+    rows = mean_rows([*own, *others])
+    if record["status"] == "done" and method not in rows:
         raise BadInput(f"{folder}: is done, but its scores are gone; run the same command with --force")
-    return RunResult(folder, record, rows, presets)
+    presets: dict[str, Rows] = {}
+    curve: list[dict[str, Any]] = []
+    damage = []
+    for file in sorted((folder / "presets").glob("*.jsonl")):
+        try:
+            _, lines = preset_lines(file)
+            mine, others = ([x for x in lines if _is_row_of(method, x["row"]) is own] for own in (True, False))
+            if found := _mixed_up(method, mine, others) if mine else f"no row of {method[:80]!a}":
+                raise BadInput(f"{file}: {found}")
+            presets[file.stem] = mean_rows(lines)
+        except BadInput as error:
+            damage.append(str(error))
+    try:
+        curve = _read_if_there(folder / "curve.jsonl", curve_points)
+    except BadInput as error:
+        damage.append(str(error))
+    return RunResult(folder, record, rows, presets, curve, tuple(damage))
+
+
+def read_results(folders: Iterable[Path]) -> tuple[list[RunResult], list[str]]:
+    """These run folders, and, one line each, those that are left out: damaged ones, and copies of a run that is
+    among them. Raises `BadInput` when none can be read."""
+    results, left_out = [], []
+    for folder in folders:
+        try:
+            results.append(read_result(folder))
+        except BadInput as error:
+            left_out.append(str(error))
+    if left_out and not results:
+        raise BadInput(left_out[0])
+    results, copies = without_copies(results)
+    return results, [*left_out, *copies]
+
+
+def without_copies(results: Sequence[RunResult]) -> tuple[list[RunResult], list[str]]:
+    """Runs without second copies of the same one, which would count twice, and a line about each copy. Of several
+    folders the one counts that has the run's own name."""
+    first: dict[str, RunResult] = {}
+    for result in results:
+        other = first.setdefault(result.record["digest"], result)
+        if _has_own_name(result) and not _has_own_name(other):
+            first[result.record["digest"]] = result
+    kept, left_out = [], []
+    for result in results:
+        one = first[result.record["digest"]]
+        if one is result:
+            kept.append(result)
+        else:
+            left_out.append(f"{result.folder}: is a copy of {one.folder}")
+    return kept, left_out
+
+
+def _has_own_name(result: RunResult) -> bool:
+    return result.folder.name.endswith(f"__{result.record['digest']}")
+
+
+def _read_if_there(file: Path, read: Callable[[Path], list[Any]]) -> list[Any]:
+    return read(file) if os.path.lexists(file) else []
+
+
+def _mixed_up(method: str, own: Sequence[dict[str, Any]], others: Sequence[dict[str, Any]]) -> str:
+    """How score lines contradict each other; "" where they do not. All rows of a group of test views have the same
+    views: a mean over fewer is not to be compared with the others."""
+    groups: dict[str, dict[str, set[tuple[Any, int]]]] = {}
+    for lines, of_method in ((own, True), (others, False)):
+        for row in {line["row"] for line in lines}:
+            if _is_row_of(method, row) is not of_method:
+                return f"row {row[:80]!a} {'is none of' if of_method else 'belongs to'} {method[:80]!a}"
+    for line in (*own, *others):
+        row = line["row"]
+        group = row.removeprefix(method) if _is_row_of(method, row) else "".join(row.partition(" [")[1:])
+        groups.setdefault(group, {}).setdefault(row, set()).add((line["camera"], line["frame"]))
+    for rows in groups.values():
+        every = set().union(*rows.values())
+        for row, views in rows.items():
+            if views != every:
+                return f"{row[:80]!a} has {len(views)} of {len(every)} test views"
+    return ""
+
+
+def _is_row_of(method: str, row: str) -> bool:
+    return row == method or (row.startswith(f"{method} [") and row.endswith("]"))
 
 
 def as_json(results: Iterable[RunResult]) -> dict[str, Any]:

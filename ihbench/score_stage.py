@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 from ihbench import atomic
 from ihbench.calibration import ROWS, Calibration
 from ihbench.contact_sheet import SheetRow, contact_sheet, write_png
+from ihbench.errors import BadInput
 from ihbench.metrics.eight_bit import rounded
 from ihbench.progress import Progress
-from ihbench.results import view_rows
+from ihbench.record import score_lines
+from ihbench.results import group_row, view_rows
 from ihbench.scoring import LoadedView, Predictor, Scorer
 from ihbench.source_digest import bench_code
 from ihbench.store import RunFolder
@@ -92,8 +94,21 @@ class ScoreStage:
         return {row: (lambda loaded, row=row: calibration.predict(row, loaded.view)) for row in ROWS}
 
     def _kept_calibration(self) -> list[dict[str, Any]] | None:
+        """Rows that an earlier run on the same data has computed. A damaged file is computed again."""
         file = self._calibration_file()
-        return None if self.force or not file.is_file() else atomic.read_json_lines(file)
+        if self.force or not file.is_file():
+            return None
+        try:
+            lines = score_lines(file)
+        except BadInput as damage:
+            self.progress.say(f"calibration rows are computed again: {damage}")
+            return None
+        views = {
+            (group_row(row, key.group), key.camera_id, key.frame)
+            for row in ROWS
+            for key in self.scorer.scene.test_keys
+        }
+        return lines if {(line["row"], line["camera"], line["frame"]) for line in lines} == views else None
 
     def _calibration_file(self) -> Path:
         """Calibration rows depend on data, protocol and the bench's code only: computed once for all runs."""

@@ -30,7 +30,7 @@ def lender(
                 continue  # a damaged record vouches for nothing
             there = other.record.get("machine") or {}
             alike = all(there.get(name) == here.get(name) for name in SAME_CLOCK)
-            if alike and other.status == "done" and _key(other, free) == wanted:
+            if alike and other.status == "done" and _key(other, free) == wanted and _last_step(file) is not None:
                 return other
     return None
 
@@ -39,17 +39,24 @@ def lend(other: RunFolder, borrower: RunFolder, state: str) -> list[dict[str, An
     """Copy the state, and the points of the quality-time curve up to it. Gives the ledger's events of that stage."""
     target = _file(borrower.path, state)
     atomic.write_bytes(target, _file(other.path, state).read_bytes())
-    last = _last_step(target)
-    points = [point for point in other.curve() if point["step"] <= last]
+    last = _last_step(target) or 0
+    try:
+        points = [point for point in other.curve() if point["step"] <= last]
+    except BadInput:  # a damaged curve is of no use, the state is
+        points = []
     atomic.write_json_lines(borrower.path / "curve.jsonl", points)
-    return [event for event in other.record["ledger"]["events"] if event["data"].get("stage") == state]
+    events = (other.record.get("ledger") or {}).get("events", [])
+    return [event for event in events if event["data"].get("stage") == state]
 
 
-def _last_step(file: Path) -> int:
-    """The step that a saved state was taken at."""
+def _last_step(file: Path) -> int | None:
+    """The step that a saved state was taken at; None for a damaged file, which nobody should borrow."""
     from ihbench.ledger import saved_meta
 
-    return int(saved_meta(file)["step"])
+    try:
+        return int(saved_meta(file)["step"])
+    except Exception:  # whatever a damaged file makes of the reader
+        return None
 
 
 def _file(folder: Path, state: str) -> Path:

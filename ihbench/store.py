@@ -22,15 +22,16 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from ihbench import atomic, locks, machine, removal
 from ihbench.errors import BadInput
 from ihbench.ledger import Ledger
 from ihbench.provenance import provenance
+from ihbench.record import Status, curve_points, read_json, record_fault, score_lines
 
 SCHEMA_VERSION = 1
-STATUSES = ("running", "done", "diverged", "failed", "interrupted", "skipped", "timeout")
+STATUSES = get_args(Status)
 FINISHED = ("done", "diverged", "skipped")  # running such a run again would end the same way
 HASH_LENGTH = 10
 LOCK = "lock"
@@ -72,14 +73,19 @@ class RunIdentity:
     @property
     def digest(self) -> str:
         """Hex digits that name this identity; equal for equal identities in any process and on any machine."""
-        canonical = json.dumps(atomic.encode(self), sort_keys=True, separators=(",", ":"), allow_nan=False)
-        return hashlib.sha256(canonical.encode()).hexdigest()[:HASH_LENGTH]
+        return identity_digest(atomic.encode(self))
 
     @property
     def folder_name(self) -> str:
         """A file name that cannot leave its folder, whatever the parts are called; the digest keeps it unique."""
         parts = (self.protocol, self.scene, self.method, self.profile, f"s{self.seed}", self.digest)
         return "__".join(plain_name(part) for part in parts)
+
+
+def identity_digest(identity: Mapping[str, Any]) -> str:
+    """The digest of an identity as a record holds it, whatever fields the version had that wrote it."""
+    canonical = json.dumps(atomic.encode(identity), sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(canonical.encode()).hexdigest()[:HASH_LENGTH]
 
 
 def plain_name(text: str) -> str:
@@ -149,10 +155,10 @@ class RunFolder:
     def open(cls, path: Path) -> RunFolder:
         """Read a run folder. Raises `BadInput` when it is none, is damaged, or is of a newer version."""
         file = Path(path) / "run.json"
-        if not file.is_file():
+        if not os.path.lexists(file):
             raise BadInput(f"{path}: not a run folder, it has no run.json; expected a folder that ihbench run made")
         try:
-            record = atomic.read_json(file)
+            record = read_json(file)
         except BadInput as error:
             raise DamagedRecord(str(error)) from error
         return cls(Path(path), _checked(file, record))
@@ -186,15 +192,13 @@ class RunFolder:
 
     def scores(self) -> list[Record]:
         """Rows of scores.jsonl; none when nothing was scored. Raises `BadInput` for a damaged file."""
-        return self._rows("scores.jsonl")
+        file = self.path / "scores.jsonl"
+        return score_lines(file) if os.path.lexists(file) else []
 
     def curve(self) -> list[Record]:
         """Quality-time points in order. Raises `BadInput` for a damaged file."""
-        return self._rows("curve.jsonl")
-
-    def _rows(self, name: str) -> list[Record]:
-        file = self.path / name
-        return atomic.read_json_lines(file) if file.is_file() else []
+        file = self.path / "curve.jsonl"
+        return curve_points(file) if os.path.lexists(file) else []
 
     def notice_death(self) -> None:
         """Of a run that says it is running, and that nobody is writing, know that it was interrupted."""
@@ -235,9 +239,14 @@ class RunFolder:
     def add_curve_point(self, point: Record) -> None:
         """Append a quality-time point, `{"step": ..., "seconds": ..., ...}`.
 
-        Points of this step or later are dropped: a resumed fit makes them again.
+        Points of this step or later are dropped: a resumed fit makes them again. A damaged file begins anew, with a
+        warning: the fit does not depend on it.
         """
-        kept = [earlier for earlier in self.curve() if earlier["step"] < point["step"]]
+        try:
+            kept = [earlier for earlier in self.curve() if earlier["step"] < point["step"]]
+        except BadInput as damage:
+            kept = []
+            self.warn(f"earlier points of the quality-time curve are lost: {damage}")
         atomic.write_json_lines(self.path / "curve.jsonl", [*kept, point])
 
     def settle(self, keep_new: bool) -> None:
@@ -281,12 +290,10 @@ def _checked(file: Path, record: Any) -> Record:
     while version < SCHEMA_VERSION:
         record = MIGRATIONS[version](record)
         version += 1
-    expected = {"status": str, "reason": str, "identity": dict, "about": dict, "created": str, "warnings": list}
-    for key, kind in expected.items():
-        if not isinstance(record.get(key), kind):
-            raise DamagedRecord(f"{file}: {key} is missing or no {kind.__name__}; run the same command with --force")
-    if record["status"] not in STATUSES:
-        raise DamagedRecord(f"{file}: unknown status {record['status']!r}; run the same command with --force")
+    if found := record_fault(record):
+        raise DamagedRecord(f"{file}: {found}; run the same command with --force")
+    if identity_digest(record["identity"]) != record["digest"]:
+        raise BadInput(f"{file}: its identity is not the one of its digest: edited, or of another run; restore it")
     return record
 
 

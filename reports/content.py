@@ -39,11 +39,13 @@ def general_report(
     presets: Sequence[str] = (),
     targets: Sequence[Target] = (),
     pictures: Sequence[tuple[Path, str]] = (),
+    left_out: Sequence[str] = (),
 ) -> list[Block]:
     """All tables of these runs, and those of further metric presets that the runs were scored under.
 
     Runs under different protocols, profiles or data never share a table, nor do presets. `targets` are qualities
-    whose times are asked for; `pictures` (file, caption) come at the end.
+    whose times are asked for; `pictures` (file, caption) come at the end, after the folders that are `left_out`, with
+    the reasons.
     """
     groups: dict[tuple[str, str, str, str], list[RunResult]] = {}
     for result in results:
@@ -52,6 +54,8 @@ def general_report(
     for runs in groups.values():
         blocks += _group(runs, presets, targets)
     blocks += across_sizes_section(results)
+    if left_out:
+        blocks += [Heading(2, "Left out"), *bullets([*left_out])]
     if pictures:
         blocks += [Heading(2, "Figures"), *(Picture(file, caption) for file, caption in pictures)]
     return blocks
@@ -237,6 +241,7 @@ def _remarks(runs: list[RunResult]) -> list[str]:
             for kind in ("notes", "doubts")
             for note in run.record["about"].get("predictions", {}).get(kind, ())
         ]
+        notes += [f"{run.method} on {run.scene}: not shown: {damage}" for damage in run.damage]
     for (label, what), scenes in omitted.items():
         notes.append(f"left out, {label} on {', '.join(dict.fromkeys(scenes))}: {what}")
     for (scene, region, note), metrics in partly.items():

@@ -42,14 +42,15 @@ def write(
     targets: Sequence[Target] = (),
     pictures: Sequence[tuple[Path, str]] = (),  # file, caption
     folder: Path = Path("."),  # where the text will lie; this report needs nothing beside it
+    left_out: Sequence[str] = (),  # folders, with the reasons
 ) -> str:
     """The report of these runs; see `general_report`. The runs' own pictures are in it, and diagrams: the ones given,
     else its own."""
     own = run_pictures(results)
     if pictures:
-        return page(general_report(results, presets, targets, [*pictures, *own]))
+        return page(general_report(results, presets, targets, [*pictures, *own], left_out))
     with TemporaryDirectory() as name:
-        return page(general_report(results, presets, targets, [*draw(results, Path(name)), *own]))
+        return page(general_report(results, presets, targets, [*draw(results, Path(name)), *own], left_out))
 
 
 def page(blocks: Sequence[Block], title: str = "ihbench report") -> str:

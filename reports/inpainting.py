@@ -4,20 +4,50 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any, TypedDict
 
-from ihbench.reports.document import Block, Heading, Paragraph, Table, Words
+from ihbench.reports.document import Block, Heading, Paragraph, Table, Words, bullets
 from ihbench.results import RunResult
+from ihbench.shape import Within, fault
 
 EVENT = "inpainted"
+Measured = Annotated[float, Within(nan=True, infinite=True)] | None
+
+
+class Drift(TypedDict):
+    delta_e: Measured
+    delta_e_floor: Measured
+    texture: Measured
+    texture_floor: Measured
+
+
+class Flicker(TypedDict):
+    deviation: Measured
+    deviation_floor: Measured
+
+
+class Painted(TypedDict):
+    """What the event of a run that painted says."""
+
+    views: Measured
+    of: Measured
+    pixels: Measured
+    identity_drift: Drift
+    flicker: Flicker
 
 
 def inpainting_section(labelled: Mapping[str, Sequence[RunResult]]) -> list[Block]:
     """A table over the runs that painted something; nothing without any."""
-    found = {label: [e for run in runs for e in _painted(run)] for label, runs in labelled.items()}
+    painted = {label: [e for run in runs for e in _painted(run)] for label, runs in labelled.items()}
+    found = {label: [e for e in events if not fault(e, Painted)] for label, events in painted.items()}
+    notes: list[Words] = [
+        f"not in the means of {label}: {len(events) - len(found[label])} whose record of it is damaged"
+        for label, events in painted.items()
+        if len(events) > len(found[label])
+    ]
     found = {label: events for label, events in found.items() if events}
     if not found:
-        return []
+        return [Heading(3, "Inpainting"), *bullets(notes)] if notes else []
     rows: list[tuple[Words, ...]] = []
     for label, events in found.items():
         drifts = [event["identity_drift"] for event in events]
@@ -39,6 +69,7 @@ def inpainting_section(labelled: Mapping[str, Sequence[RunResult]]) -> list[Bloc
             "Drift: painted surface against the mean of what other views show of it; flicker: standard deviation of "
             "painted surface over views. Floors: the same for surface that was seen, lighting and resampling alone."
         ),
+        *bullets(notes),
     ]
 
 

@@ -9,9 +9,12 @@ from ihbench.results import RunResult
 
 def by_label(runs: Sequence[RunResult]) -> dict[str, list[RunResult]]:
     """Runs by their row's label, in the order given. Seeds and scenes of one configuration share a row."""
+    codes: dict[str, set[str]] = {}
+    for run in runs:
+        codes.setdefault(run.method, set()).add(run.identity["code"])
     found: dict[str, list[RunResult]] = {}
     for run in runs:
-        found.setdefault(label_of(run, runs), []).append(run)
+        found.setdefault(_label(run, several_codes=len(codes[run.method]) > 1), []).append(run)
     return {_with_views(label, row): row for label, row in found.items()}
 
 
@@ -25,11 +28,11 @@ def _with_views(label: str, runs: Sequence[RunResult]) -> str:
     return f"{label.removesuffix(')')}, {told})"
 
 
-def label_of(run: RunResult, runs: Sequence[RunResult]) -> str:
+def _label(run: RunResult, several_codes: bool) -> str:
     """The method with what sets this row apart. Runs of several versions of its code are several rows."""
     changed = list(run.record["about"]["changed"])
     if run.record["about"].get("provenance") == "predictions":
         changed.append("predictions")
-    if len({other.identity["code"] for other in runs if other.method == run.method}) > 1:
+    if several_codes:
         changed.append(f"code {run.identity['code']}")
     return run.method + (f" ({', '.join(changed)})" if changed else "")

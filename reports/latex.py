@@ -42,9 +42,10 @@ def write(
     targets: Sequence[Target] = (),
     pictures: Sequence[tuple[Path, str]] = (),  # file, caption
     folder: Path = Path("."),  # where the text will lie
+    left_out: Sequence[str] = (),  # folders, with the reasons
 ) -> str:
     """The report of these runs; see `general_report`."""
-    return latex(general_report(results, presets, targets, pictures), folder)
+    return latex(general_report(results, presets, targets, pictures, left_out), folder)
 
 
 def latex(blocks: Sequence[Block], folder: Path = Path(".")) -> str:

@@ -148,7 +148,7 @@ def _stamped(run: RunResult) -> float:
     )
     if again or "redone" in ledger["stages"] or not {"created", "updated"} <= record.keys():
         return math.nan
-    if list((run.folder / "presets").glob("*.jsonl")):  # scored again later
+    if run.presets:  # scored again later
         return math.nan
     between = datetime.fromisoformat(record["updated"]) - datetime.fromisoformat(record["created"])
     return between.total_seconds() + float(ledger["stages"].get(BEFORE, {}).get("seconds", 0.0))

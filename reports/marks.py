@@ -7,6 +7,7 @@ scenes are: a mark is given only to a number that differs from every other one o
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -18,8 +19,8 @@ BEST, SECOND = "best", "second"
 def ranks(values: Sequence[float], higher_is_better: bool) -> list[int]:
     """1 + how many are strictly better; 0 for NaN, which has no rank."""
     sign = 1 if higher_is_better else -1
-    known = [sign * value for value in values if not math.isnan(value)]
-    return [0 if math.isnan(value) else 1 + sum(other > sign * value for other in known) for value in values]
+    known = sorted(sign * value for value in values if not math.isnan(value))
+    return [0 if math.isnan(value) else 1 + len(known) - bisect_right(known, sign * value) for value in values]
 
 
 def marks_by_value(values: Sequence[float], higher_is_better: bool) -> list[str]:
@@ -63,10 +64,8 @@ def marks_by_interval(
                 reasons.append(f"no {mark} mark: {labels[k]} against {labels[j]}: {doubt}")
                 break
     # of several rows with one number, all have the mark or none
-    kept = [
-        "" if any(not kept[j] for j in range(len(kept)) if ranked[j] == ranked[k]) else kept[k]
-        for k in range(len(kept))
-    ]
+    bare = {ranked[k] for k in range(len(kept)) if not kept[k]}
+    kept = ["" if ranked[k] in bare else kept[k] for k in range(len(kept))]
     return IntervalMarks(kept, "; ".join(reasons))
 
 

@@ -104,11 +104,18 @@ def _letter(k: int) -> str:
     return ("" if k < 26 else _letter(k // 26 - 1)) + chr(ord("a") + k % 26)
 
 
-def build_frame(table: PaperTable, results: Sequence[RunResult], region: str = "", as_printed: bool = False) -> Frame:
+def build_frame(
+    table: PaperTable,
+    results: Sequence[RunResult],
+    region: str = "",
+    as_printed: bool = False,
+    left_out: Sequence[str] = (),
+) -> Frame:
     """The table's frame, filled from the paper and from these runs.
 
     `results` under other protocols than the table's are left out. `region` is that of measured numbers; "" is every
-    protocol's headline. `as_printed` gives quoted rows the paper's own marks in place of computed ones.
+    protocol's headline. `as_printed` gives quoted rows the paper's own marks in place of computed ones. `left_out`
+    are run folders that could not be read, with the reasons.
     """
     footnotes = _Footnotes()
     blocks = [_quoted(table, footnotes, as_printed)]
@@ -117,6 +124,7 @@ def build_frame(table: PaperTable, results: Sequence[RunResult], region: str = "
     if len(blocks) == 1:
         protocols = dict.fromkeys(p for group in table.groups for p in group.protocols)
         notes.append(f"No measured rows: no finished run under {', '.join(protocols)} was found.")
+    notes += [f"Left out: {line}." for line in left_out]
     letters = {letter: text for text, letter in footnotes.letters.items()}
     return Frame(table.name, table.title, table.source, table.head, tuple(blocks), letters, tuple(notes))
 
@@ -223,12 +231,13 @@ def _measured_block(
     calibrations = [name for name in ROWS if any(name in run.rows for run in everything)]
     for group, runs in filled:
         done = [run for run in runs if run.status == "done"]
+        here = {id(run) for run in runs}
         shown_region = region or (done[0].record["about"]["headline"] if done else "")
         identities = [_identity(done, group, column.key, shown_region) for column in group.columns]
         notes += _about(group, runs, done, shown_region, identities)
         for column, identity in zip(group.columns, identities, strict=True):
             ranked = [
-                _cell(column, [run for run in having if run in runs], group.views, identity, kind, footnotes)
+                _cell(column, [run for run in having if id(run) in here], group.views, identity, kind, footnotes)
                 for having in labelled.values()
             ]
             marks = marks_by_interval(
@@ -389,7 +398,11 @@ def _one(component: Component, configs: Sequence[Mapping[str, Any]]) -> str:
         all(bool(config[name]) for name in component.on)
         and all(config[name] == value for name, value in component.equal)
         and not any(config.get(name) for name in component.off)
-        and (not component.several or len(config[component.several]) > 1)
+        and (not component.several or _several(config[component.several]))
         for config in configs
     }
     return UNKNOWN if len(found) != 1 else YES if found.pop() else NO
+
+
+def _several(value: Any) -> bool:
+    return isinstance(value, list | tuple) and len(value) > 1

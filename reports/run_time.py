@@ -4,6 +4,7 @@ and area under the quality-time curve."""
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
@@ -33,6 +34,7 @@ from ihbench.results import RunResult
 
 ON_THE_CURVE = ("psnr", "flip")  # targets are chosen for these where none is stated
 SPREAD = f"{LEVEL:.0%}"
+MOST_SETS = 60  # of scenes, whose pairs are looked at
 
 
 @dataclass(frozen=True)
@@ -52,16 +54,18 @@ def comparable(configs: Sequence[Configuration]) -> tuple[list[Configuration], l
     """Configurations that can be compared, and the scenes that all of these were run on.
 
     Where no scene is common to all, or few are, those rows stand back that lack what most others have: chosen are the
-    scenes of one row, or what two have in common, with the most rows times scenes.
+    scenes of one row, or what two have in common, with the most rows times scenes. Of very many different sets of
+    scenes those are looked at that most rows have.
     """
     own = [frozenset(run.scene for run in c.runs) for c in configs]
-    choices = dict.fromkeys(a & b for a in own for b in own if a & b)
-    best: tuple[list[Configuration], frozenset[str]] = ([], frozenset())
-    for scenes in choices:
-        members = [c for c, having in zip(configs, own, strict=True) if scenes <= having]
-        if (len(members) * len(scenes), len(members)) > (len(best[0]) * len(best[1]), len(best[0])):
-            best = members, scenes
-    return best[0], sorted(best[1])
+    rows = Counter(own)
+    several = [scenes for scenes, _ in rows.most_common(MOST_SETS)] if len(rows) > MOST_SETS else list(rows)
+    best, most = frozenset(), (0, 0)
+    for scenes in dict.fromkeys(a & b for a in several for b in several if a & b):
+        members = sum(count for having, count in rows.items() if scenes <= having)
+        if (members * len(scenes), members) > most:
+            best, most = scenes, (members * len(scenes), members)
+    return [c for c, having in zip(configs, own, strict=True) if best and best <= having], sorted(best)
 
 
 def work_points(configs: Sequence[Configuration], identity: str, scenes: Sequence[str]) -> list[WorkPoint]:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from ihbench import atomic, outputs
 from ihbench.commands.parse import options
 from ihbench.errors import BadInput
+
+if TYPE_CHECKING:
+    from ihbench.results import RunResult
 
 
 @dataclass(frozen=True)
@@ -45,12 +47,8 @@ class TableCommand:
 
         outputs.check_file(chosen.out)
         table = paper_table(self.name)
-        frame = build_frame(
-            table,
-            _results(chosen, [p for group in table.groups for p in group.protocols]),
-            chosen.region,
-            chosen.as_printed,
-        )
+        results, left_out = _results(chosen, [p for group in table.groups for p in group.protocols])
+        frame = build_frame(table, results, chosen.region, chosen.as_printed, left_out)
         text = _writer(chosen.format)(frame)
         if chosen.out is None:
             print(text, end="")
@@ -74,28 +72,27 @@ def _writer(name: str) -> Callable[..., str]:
     return write
 
 
-def _results(chosen: TableOptions, protocols: list[str]) -> list:
-    """Runs under these protocols. No folder of runs is no error: the paper's rows are there without one."""
-    from ihbench.index import UNREADABLE, Index
-    from ihbench.results import read_result
+def _results(chosen: TableOptions, protocols: list[str]) -> tuple[list[RunResult], list[str]]:
+    """Runs under these protocols, and the folders left out. No folder of runs is no error: the paper's rows
+    are there without one."""
+    from ihbench.commands.report import say_left_out
+    from ihbench.index import Index
 
     if not chosen.runs.is_dir():
         if chosen.runs != TableOptions.runs:
             raise BadInput(f"--runs {chosen.runs}: no such folder; give a folder of runs or leave it out")
-        return []
+        return [], []
     wanted = {name: getattr(chosen, name) for name in ("method", "profile")}
     wanted = {name: value for name, value in wanted.items() if value is not None}
-    index = Index(chosen.runs)
-    for row in index.query(status=UNREADABLE):
-        print(f"ihbench: left out: {chosen.runs / row['path']}: {row['reason']}", file=sys.stderr)
-    found = []
+    results: list[RunResult] = []
+    left_out: list[str] = []
     for protocol in dict.fromkeys(protocols):
-        for row in index.query(protocol=protocol, **wanted):
-            try:
-                found.append(read_result(chosen.runs / row["path"]))
-            except BadInput as error:
-                print(f"ihbench: left out: {error}", file=sys.stderr)
-    return found
+        having, without = Index(chosen.runs).results(protocol=protocol, **wanted)
+        results += having
+        left_out += without
+    left_out = list(dict.fromkeys(left_out))
+    say_left_out(left_out)
+    return results, left_out
 
 
 TABLE1 = TableCommand("table1", "The paper's Table 1: quoted rows, and what is measured here.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,9 +13,12 @@ import tyro
 from ihbench import atomic, outputs, registry
 from ihbench.commands.parse import options
 from ihbench.errors import BadInput
+from ihbench.visible_text import visible
 
 if TYPE_CHECKING:
     from ihbench.results import RunResult
+
+SHOWN = 20  # folders left out that are named on stderr
 
 
 @dataclass(frozen=True)
@@ -56,27 +60,20 @@ def main(argv: list[str]) -> int:
     chosen = options(ReportOptions, argv, "report", about)
     from ihbench.metrics.evaluate import find_preset
     from ihbench.quality_time import Target
-    from ihbench.results import read_result
+    from ihbench.results import read_results
 
     outputs.check_file(chosen.out)
     write = registry.load("report", chosen.format)
-    folders = chosen.run or _matching(chosen)
-    if not folders:
+    targets = [Target.parse(text) for text in chosen.target]
+    for name in chosen.preset:
+        find_preset(name)
+    results, left_out = read_results(chosen.run) if chosen.run else _matching(chosen)
+    say_left_out(left_out)
+    if not results:
         raise BadInput(
             f"no run folders under {chosen.runs} match; "
             "make one with: ihbench run --protocol zju_occ --scene standin-1"
         )
-    results = []
-    targets = [Target.parse(text) for text in chosen.target]
-    for name in chosen.preset:
-        find_preset(name)
-    for folder in folders:
-        try:
-            results.append(read_result(folder))
-        except BadInput as error:
-            if chosen.run:
-                raise
-            print(f"ihbench: left out: {error}", file=sys.stderr)
     if chosen.preset:
         results = [_with_presets(result, chosen) for result in results]
     pictures: list[tuple[Path, str]] = []
@@ -84,7 +81,7 @@ def main(argv: list[str]) -> int:
         for name in registry.names("figure"):
             pictures += registry.load("figure", name)(results, chosen.figures)
     folder = Path(".") if chosen.out is None else chosen.out.parent
-    text = write(results, chosen.preset, targets=targets, pictures=pictures, folder=folder)
+    text = write(results, chosen.preset, targets=targets, pictures=pictures, folder=folder, left_out=left_out)
     if chosen.out is None:
         print(text, end="")
     else:
@@ -110,12 +107,19 @@ def _with_presets(result: RunResult, chosen: ReportOptions) -> RunResult:
     return read_result(result.folder)
 
 
-def _matching(chosen: ReportOptions) -> tuple[Path, ...]:
-    """Run folders under --runs that match the filters, from the index."""
+def _matching(chosen: ReportOptions) -> tuple[list[RunResult], list[str]]:
+    """Runs under --runs that match the filters, and the folders left out."""
     from ihbench.index import Index
 
     if not chosen.runs.is_dir():
-        return ()
+        return [], []
     wanted = {name: getattr(chosen, name) for name in ("protocol", "method", "scene", "profile")}
-    rows = Index(chosen.runs).query(**{name: value for name, value in wanted.items() if value is not None})
-    return tuple(chosen.runs / row["path"] for row in rows)
+    return Index(chosen.runs).results(**{name: value for name, value in wanted.items() if value is not None})
+
+
+def say_left_out(lines: Sequence[str]) -> None:
+    """Name the folders that a report leaves out on stderr, the first of very many."""
+    for line in lines[:SHOWN]:
+        print(f"ihbench: left out: {visible(line)}", file=sys.stderr)
+    if len(lines) > SHOWN:
+        print(f"ihbench: left out: {len(lines) - SHOWN} more; the report names them", file=sys.stderr)

@@ -2,24 +2,32 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
+import shutil
+import sqlite3
+import subprocess
+import sys
 from dataclasses import replace
 
 import pytest
 
+from ihbench import index
 from ihbench.errors import BadInput
 from ihbench.index import Index
+from ihbench.results import read_result
 from ihbench.store import RunFolder
 from tests.bench.test_store import IDENTITY
+from tests.reports.fake_runs import about
 
 PSNR = "psnr/pooled/range1/body/v1"
 HIDDEN = "psnr/pooled/range1/hidden/v1"
 
 
 def finished(runs, values=(20.0, 30.0), **changes) -> RunFolder:
-    run = RunFolder.create(runs, replace(IDENTITY, **changes))
+    run = RunFolder.create(runs, replace(IDENTITY, **changes), about())
     run.write_scores(
         [
             {"row": "inpainthuman", "camera": "1", "frame": i, "scores": {PSNR: value, HIDDEN: math.nan},
@@ -31,6 +39,18 @@ def finished(runs, values=(20.0, 30.0), **changes) -> RunFolder:
     return run
 
 
+@pytest.fixture(autouse=True)
+def old_files(monkeypatch):
+    """Files are taken for old at once: else what was written a moment ago is read again."""
+    monkeypatch.setattr(index, "FRESH", 0)
+
+
+def means(runs, **filters) -> dict:
+    """(scene, identity) -> mean of the method's own row."""
+    results, _ = Index(runs).results(**filters)
+    return {(run.scene, identity): mean for run in results for identity, mean in run.rows[run.method].items()}
+
+
 def test_runs_and_mean_scores(tmp_path):
     run = finished(tmp_path, values=(20.0, math.inf, 30.0))
     (row,) = Index(tmp_path).query()
@@ -38,9 +58,14 @@ def test_runs_and_mean_scores(tmp_path):
     assert [row[key] for key in ("protocol", "scene", "method", "profile", "seed", "status")] == [
         "zju_occ@1", "377", "inpainthuman", "quick", 0, "done",
     ]  # fmt: skip
-    scores = {score["identity"]: score for score in Index(tmp_path).scores()}
-    assert (scores[PSNR]["value"], scores[PSNR]["n"], scores[PSNR]["row"]) == (25.0, 2, "inpainthuman")
-    assert (scores[HIDDEN]["value"], scores[HIDDEN]["reason"]) == (None, "no truth")
+    for _ in range(2):  # read from the folder, then from the index
+        (result,), left_out = Index(tmp_path).results()
+        assert left_out == []
+        assert result.folder == run.path
+        mean = result.rows["inpainthuman"][PSNR]
+        assert (mean.value, mean.n, mean.infinite) == (25.0, 2, 1)
+        assert (result.rows["inpainthuman"][HIDDEN].reason) == "no truth"
+        assert result.record == RunFolder.open(run.path).record
 
 
 def test_filters(tmp_path):
@@ -53,35 +78,120 @@ def test_filters(tmp_path):
     assert len(index.query(protocol="zju%")) == 0
     assert [row["scene"] for row in index.query(protocol="zju_occ", scene="386")] == ["386"]
     assert [row["seed"] for row in index.query(seed=3)] == [3]
-    assert len(index.scores(scene="386")) == 2
+    assert len(means(tmp_path, scene="386")) == 2
     with pytest.raises(ValueError, match="colour"):
         index.query(colour="red")
 
 
-def test_changes_are_seen_without_asking(tmp_path):
+def test_changes_are_seen_without_asking_and_nothing_else_is_read(tmp_path, monkeypatch):
     run = finished(tmp_path)
-    index = Index(tmp_path)
-    assert len(index.query()) == 1
-    finished(tmp_path, scene="386")
-    assert len(index.query()) == 2
-    run.write_scores([])
-    assert len(index.scores(scene="377")) == 0
+    assert means(tmp_path)["377", PSNR].value == 25.0
+    other = finished(tmp_path, scene="386")
+    read = []
+    monkeypatch.setattr(index, "read_result", lambda folder: read.append(folder) or read_result(folder))
+    assert len(means(tmp_path)) == 4
+    assert read == [other.path]
+    scores = run.path / "scores.jsonl"
+    before = scores.stat()
+    scores.write_text(scores.read_text().replace("20.0", "40.0"))
+    os.utime(scores, ns=(before.st_atime_ns, before.st_mtime_ns))  # as a copy may
+    assert means(tmp_path, scene="377")["377", PSNR].value == 35.0
+    assert read == [other.path, run.path]
     run.set_status("failed", "x")
-    assert [row["scene"] for row in index.query(status="failed")] == ["377"]
+    assert [row["scene"] for row in Index(tmp_path).query(status="failed")] == ["377"]
+    shutil.rmtree(run.path)
+    assert [row["scene"] for row in Index(tmp_path).query()] == ["386"]
+    assert read == [other.path, run.path, run.path]
 
 
-def test_the_index_is_used_while_nothing_changed_and_made_again_when_damaged(tmp_path, monkeypatch):
+@pytest.mark.parametrize("damage", ["gone", "empty", "header", "cut", "scrambled", "edited", "no table", "old"])
+def test_a_damaged_or_edited_index_changes_no_answer_and_is_made_again(tmp_path, monkeypatch, damage):
     finished(tmp_path)
-    index = Index(tmp_path)
-    first = index.query()
-    for damage in (b"", b"no database", None):
-        if damage is None:
-            index.file.unlink()
-        else:
-            index.file.write_bytes(damage)
-        assert index.query() == first
-    monkeypatch.setattr(index, "rebuild", lambda: pytest.fail("made again for nothing"))
-    assert index.query() == first
+    first, file = str(means(tmp_path)), Index(tmp_path).file
+    data = file.read_bytes()
+    if damage == "edited":
+        with sqlite3.connect(file) as database:
+            database.execute("UPDATE runs SET scene = '386', seed = 'x'")
+    elif damage == "no table":
+        with sqlite3.connect(file) as database:
+            database.execute("DROP TABLE runs")
+    elif damage == "old":
+        file.unlink()
+        with sqlite3.connect(file) as database:
+            for table, columns in (("about", "signature TEXT"), ("runs", "id TEXT"), ("scores", "run TEXT")):
+                database.execute(f"CREATE TABLE {table} ({columns})")
+    else:
+        file.unlink()
+        middle = len(data) // 2
+        changed = {
+            "empty": b"", "header": data[:16] + bytes(40) + data[56:], "cut": data[:middle],
+            "scrambled": data[:4096] + bytes(b ^ 1 for b in data[4096:]),
+        }  # fmt: skip
+        if damage in changed:
+            file.write_bytes(changed[damage])
+    assert str(means(tmp_path)) == first
+    assert str(means(tmp_path)) == first
+    monkeypatch.setattr(index, "read_result", lambda folder: pytest.fail("read again for nothing"))
+    assert str(means(tmp_path)) == first
+
+
+def test_what_is_not_an_index_is_left_alone(tmp_path):
+    finished(tmp_path)
+    file, first = Index(tmp_path).file, str(means(tmp_path))
+    file.unlink()
+    file.write_bytes(b"somebody's notes")
+    assert str(means(tmp_path)) == first
+    assert file.read_bytes() == b"somebody's notes"
+    file.unlink()
+    with sqlite3.connect(file) as database:
+        database.execute("CREATE TABLE runs (distance REAL)")
+        database.execute("INSERT INTO runs VALUES (42.2)")
+    assert str(means(tmp_path)) == first
+    with sqlite3.connect(file) as database:
+        assert database.execute("SELECT * FROM runs").fetchall() == [(42.2,)]
+    for elsewhere in (tmp_path / "elsewhere.sqlite", tmp_path / "pipe"):
+        file.unlink()
+        file.symlink_to(elsewhere)
+        assert str(means(tmp_path)) == first
+        assert not elsewhere.exists()
+    file.unlink()
+    os.mkfifo(file)
+    assert str(means(tmp_path)) == first
+
+
+@pytest.mark.parametrize("error", [sqlite3.OperationalError("disk I/O error"), OSError(errno.EROFS, "read-only")])
+def test_where_it_cannot_be_written_the_answer_is_the_same(tmp_path, monkeypatch, error):
+    finished(tmp_path)
+
+    def refused(*_args, **_more):
+        raise error
+
+    monkeypatch.setattr(index.sqlite3, "connect", refused)
+    assert means(tmp_path)["377", PSNR].value == 25.0
+    assert [entry.name for entry in tmp_path.iterdir() if entry.is_file()] == []
+
+
+def test_processes_that_write_the_index_at_once_do_not_mind(tmp_path):
+    for seed in range(4):
+        finished(tmp_path, seed=seed)
+    code = (
+        "import sys; from pathlib import Path; from ihbench import index; index.FRESH = 10**12\n"
+        "for _ in range(20): assert len(index.Index(Path(sys.argv[1])).results()[0]) == 4"
+    )
+    rivals = [subprocess.Popen([sys.executable, "-c", code, str(tmp_path)]) for _ in range(3)]
+    assert [rival.wait() for rival in rivals] == [0, 0, 0]
+    assert len(means(tmp_path)) == 2
+
+
+def test_a_copy_of_a_run_counts_once(tmp_path):
+    run = finished(tmp_path)
+    shutil.copytree(run.path, tmp_path / "a-copy")
+    for _ in range(2):
+        results, left_out = Index(tmp_path).results()
+        assert [result.folder for result in results] == [run.path]
+        assert left_out == [f"{tmp_path / 'a-copy'}: is a copy of {run.path}"]
+    shutil.rmtree(run.path)
+    assert [result.folder.name for result in Index(tmp_path).results()[0]] == ["a-copy"]
 
 
 def test_hostile_folders_are_listed_and_break_nothing(tmp_path):
@@ -118,13 +228,13 @@ def test_hostile_folders_are_listed_and_break_nothing(tmp_path):
     (tmp_path / "notes").mkdir()  # nor is a folder without a record
     (tmp_path / "notes.txt").write_text("x")
 
-    index = Index(tmp_path)
-    assert index.rebuild() == 1 + len(contents) + len(changes) + 4 + 3 + 1
-    bad = index.query(status="unreadable")
-    assert len(bad) == len(index.query()) - 1
+    bad = Index(tmp_path).query(status="unreadable")
+    assert len(bad) == len(contents) + len(changes) + 4 + 3 + 1
+    assert len(bad) == len(Index(tmp_path).query()) - 1
     assert all(row["reason"] for row in bad)
-    assert [row["id"] for row in index.query(status="done")] == [good.path.name]
-    assert {score["run"] for score in index.scores()} == {good.path.name}
+    results, left_out = Index(tmp_path).results(scene="377")
+    assert [result.folder for result in results] == [good.path]
+    assert len(left_out) == len(bad)
 
 
 def test_odd_texts_in_a_record_are_kept_as_text(tmp_path):

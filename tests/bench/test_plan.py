@@ -32,6 +32,7 @@ from ihbench.protocol import REGIONS
 from ihbench.scene import BodyPose
 from ihbench.views import open_scene
 from ihbench.visibility import texel_visibility
+from tests.reports.fake_runs import identity
 
 from .fake_capture import DISTANCE, DISTORTION, FOCAL, SIZE, FakeCapture, a_camera, a_pose, fake_protocol, the_body
 from .fake_capture import turning_capture as turning
@@ -256,12 +257,19 @@ def test_only_some_of_many_views_are_read(monkeypatch):
 def a_run(
     seconds, method="inpainthuman", profile="quick", status="done", protocol="p@1", cpu="one", code="1", **about
 ):
+    own = identity("a", method, profile=profile, protocol=protocol, code=code)
+    stages = {"fit/stage1": {"seconds": 0.5 * seconds}} if isinstance(seconds, int) else {}
     return {
+        "schema_version": 1,
         "status": status,
-        "identity": {"method": method, "profile": profile, "protocol": protocol, "code": code},
+        "reason": "",
+        "digest": own.digest,
+        "identity": vars(own),
         "about": {"total_seconds": seconds, "changed": [], "left_out": [], **about},
+        "created": "2025-01-01T00:00:00+00:00",
         "machine": {"cpu": cpu},
-        "ledger": {"stages": {"fit/stage1": {"seconds": 0.5 * seconds}}} if isinstance(seconds, int) else {},
+        "ledger": {"stages": stages, "seconds": 0.0, "cpu_seconds": 0.0, "events": []},
+        "warnings": [],
     }
 
 

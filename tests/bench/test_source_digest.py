@@ -9,15 +9,17 @@ import sys
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from ihbench import atomic, registry, source_digest
 from ihbench.calibration import Calibration
 from ihbench.errors import BadInput
+from ihbench.ledger import Ledger
 from ihbench.protocol import load_protocol
 from ihbench.shared_states import lender
 from ihbench.source_digest import bench_code, code_of, tree_digest
-from ihbench.store import RunFolder
+from ihbench.store import RunFolder, identity_digest
 from tests.bench.test_house import imports
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -265,6 +267,7 @@ def test_a_run_from_before_the_bench_was_hashed_is_readable_and_not_found(bench,
     os.replace(new, old)
     record = atomic.read_json(old / "run.json")
     record["identity"]["code"] = "0.1.0+c0ffee00"
+    record["digest"] = identity_digest(record["identity"])
     atomic.write_json(old / "run.json", record)
     assert "mannequin" in bench("report", "--runs", bench.runs).out
     assert bench.run(method=mannequin).status == 0
@@ -302,10 +305,12 @@ def test_presets_scored_by_other_code_are_scored_again(bench, mannequin, other_c
 def test_no_state_is_taken_from_a_run_of_other_code(bench, mannequin):
     assert bench.run("--seed", 0, method=mannequin).status == 0
     (folder,) = bench.folders()
-    (folder / "checkpoints").mkdir()
-    (folder / "checkpoints" / "fit.safetensors").write_bytes(b"")
+    Ledger(folder).save_state("fit", {"x": np.zeros(1)}, {"step": 1})
     here = atomic.read_json(folder / "run.json")["machine"]
     borrower = RunFolder(bench.runs / "new", {"identity": dict(RunFolder.open(folder).identity)})
     assert lender(bench.runs, borrower, "fit", (), here) is not None
     borrower.identity["code"] += "1"
+    assert lender(bench.runs, borrower, "fit", (), here) is None
+    borrower.identity["code"] = borrower.identity["code"][:-1]
+    (folder / "checkpoints" / "fit.safetensors").write_bytes(b"")  # nor one that cannot be read
     assert lender(bench.runs, borrower, "fit", (), here) is None

@@ -7,7 +7,7 @@ import os
 import signal
 import subprocess
 import sys
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 
 import pytest
@@ -150,11 +150,12 @@ def test_a_runs_folder_that_is_a_file_is_said(tmp_path):
 
 def test_force_does_not_empty_a_run_in_use(tmp_path, monkeypatch):
     run = RunFolder.create(tmp_path, IDENTITY)
-    run.write_scores([{"a": 1}])
+    line = {"row": "inpainthuman", "camera": "1", "frame": 0, "scores": {}, "absent": {}}
+    run.write_scores([line])
     monkeypatch.setattr(locks, "WAIT", 0.0)
     with run.lock(), pytest.raises(BadInput, match=f"being written by process {os.getpid()};"):
         RunFolder.create(tmp_path, IDENTITY, force=True)
-    assert run.scores() == [{"a": 1}]
+    assert run.scores() == [line]
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", "{}", '{"schema_version": 1}', '{"schema_version": "1"}'])
@@ -194,9 +195,14 @@ def test_older_records_are_brought_up_step_by_step(tmp_path, monkeypatch):
 
 def test_another_run_under_the_same_name_is_not_overwritten(tmp_path):
     run = RunFolder.create(tmp_path, IDENTITY)
-    run.record["identity"]["config"]["steps"] = 999
+    other = replace(IDENTITY, config={"steps": 999})
+    run.record |= {"identity": json.loads(json.dumps(asdict(other))), "digest": other.digest}
     run.save()
     with pytest.raises(BadInput, match="another run"):
+        RunFolder.create(tmp_path, IDENTITY)
+    run.record["identity"]["config"]["steps"] = 998
+    run.save()
+    with pytest.raises(BadInput, match="not the one of its digest"):
         RunFolder.create(tmp_path, IDENTITY)
 
 
@@ -206,13 +212,17 @@ def test_a_folder_without_a_record_is_no_run(tmp_path):
 
 
 def test_the_curve_grows_and_can_be_rewound(tmp_path):
-    run = RunFolder.create(tmp_path, IDENTITY)
+    run, psnr = RunFolder.create(tmp_path, IDENTITY), "psnr/pooled/range1/body/v1"
     assert run.curve() == []
     for seconds in (2.0, 4.0, 8.0):
-        run.add_curve_point({"step": int(seconds), "seconds": seconds, "scores": {"psnr": float("inf")}})
+        run.add_curve_point({"step": int(seconds), "seconds": seconds, "scores": {psnr: float("inf")}})
     run.add_curve_point({"step": 4, "seconds": 5.0, "scores": {}})  # a resumed fit comes by again
     assert [(point["step"], point["seconds"]) for point in run.curve()] == [(2, 2.0), (4, 5.0)]
-    assert run.curve()[0]["scores"]["psnr"] == float("inf")
+    assert run.curve()[0]["scores"][psnr] == float("inf")
+    (run.path / "curve.jsonl").write_text("{}\n")
+    run.add_curve_point({"step": 9, "seconds": 9.0, "scores": {}})  # the fit goes on beside a damaged file
+    assert [point["step"] for point in run.curve()] == [9]
+    assert "step is missing" in run.record["warnings"][0]
 
 
 def test_warnings_are_kept_once(tmp_path):

@@ -8,6 +8,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 
 from ihbench.metrics import Mean
+from ihbench.record import curve_points
 from ihbench.results import RunResult
 
 PSNR, FLIP = "psnr/pooled/range1/{}/v1", "flip/ldr-67ppd/srgb/{}/v1"
@@ -80,7 +81,8 @@ def made_up(
             "stages": {k: {"seconds": s, "entered": 1, "peak_device_mb": 0.0} for k, s in spent.items()},
         },
     }  # fmt: skip
-    return RunResult(path, record, {method: means})
+    points = curve_points(path / "curve.jsonl") if curve is not None else []
+    return RunResult(path, record, {method: means}, curve=points)
 
 
 def sweep(folder: Path, scenes=("a", "b"), seeds=(0,)) -> list[RunResult]:

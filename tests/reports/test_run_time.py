@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import re
+from dataclasses import replace
 
 import pytest
 
@@ -226,8 +227,7 @@ def test_odd_runs_are_drawn_as_far_as_they_have_numbers(tmp_path):
 
 
 def test_a_damaged_curve_is_named(tmp_path):
-    runs = [made_up(tmp_path), made_up(tmp_path, seed=1)]
-    (runs[1].folder / "curve.jsonl").write_text('{"step": 1, "sec')
+    runs = [made_up(tmp_path), replace(made_up(tmp_path, seed=1), curve=[], damage=("curve.jsonl: cut",))]
     assert f"without a readable curve.jsonl: {runs[1].folder.name}" in section(runs)
 
 
