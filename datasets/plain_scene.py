@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from ihbench import atomic
 from ihbench.body import Body, from_zju_root, load_body, write_body, zju_root
+from ihbench.body.skeleton import pose_hint
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera
 from ihbench.datasets.capture_folder import CaptureFolder
@@ -369,7 +370,9 @@ def read_poses(path: Path) -> Poses:
     pose, betas, transl = (_floats(arrays, key, path) for key in ("pose", "betas", "transl"))
     n = len(pose) if pose.ndim else 0
     if n == 0 or pose.shape not in ((n, 72), (n, 24, 3)):
-        raise BadInput(f"{path}: pose: expected shape [N, 72] or [N, 24, 3], found {list(pose.shape)}")
+        raise BadInput(
+            f"{path}: pose: expected shape [N, 72] or [N, 24, 3], found {list(pose.shape)}{pose_hint(pose.shape[1:])}"
+        )
     if transl.shape != (n, 3):
         raise BadInput(f"{path}: transl: expected shape [{n}, 3], a row for each pose, found {list(transl.shape)}")
     if betas.ndim == 1:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from ihbench.progress import Progress
 
 
+OTHER_POSE = "; ihbench.body.pose_estimators takes what pose estimators write"
 MOST_RADIANS = 8 * np.pi  # of one number of a pose: fits may count whole turns, but nobody's count four
 
 
@@ -45,7 +46,7 @@ class BodyPose:
             }
             raise BadValue(
                 f"body pose: expected pose [24, 3], betas [B], transl [3], "
-                f"got {self.pose.shape}, {self.betas.shape}, {self.transl.shape}{words.get(self.pose.shape, '')}"
+                f"got {self.pose.shape}, {self.betas.shape}, {self.transl.shape}{words.get(self.pose.shape, OTHER_POSE)}"
             )
         if (np.abs(self.pose) > MOST_RADIANS).any():
             raise BadValue(

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.body.root_convention import from_zju_root
+from ihbench.body.skeleton import SMPLX_SIZES, pose_hint
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera, as_numbers, check_intrinsics, check_rotation
 from ihbench.errors import BadInput
@@ -103,7 +104,7 @@ def from_world(
     up: str = "y",  # the world axis against gravity: "y" or "z"
     pixel_center: float = 0.5,
 ) -> tuple[Camera, BodyPose]:
-    """WHAM ("global"), SLAHMR, and GVHMR after `from_smplx`: a body in a gravity-aligned world and the frame's camera.
+    """WHAM ("global"), SLAHMR, GVHMR after `from_smplx`: a body in a gravity-aligned world and the frame's camera.
 
     The world is kept as it is. Raises `BadInput`, also when image and body together stand along another axis than
     `up`: then the world was turned or flipped on the way. (Either of them alone may lie or look down.)
@@ -260,45 +261,9 @@ def _pose(pose: Any) -> Array:
         return matrix_to_axis_angle(array.reshape(24, 3, 3))
     if shape not in ((72,), (24, 3)):
         raise BadInput(
-            f"pose: expected 72 numbers of axis-angle, [72] or [24, 3], got {list(array.shape)}{_pose_hint(array)}"
+            f"pose: expected 72 numbers of axis-angle, [72] or [24, 3], got {list(array.shape)}{pose_hint(array.shape)}"
         )
     return array.reshape(24, 3)
-
-
-SMPLX_SIZES = {  # numbers of a pose whose first 22 joints are SMPL's -> whose it is
-    66: "SMPL-X or SMPL-H without hands, as GVHMR writes them",
-    78: "EasyMocap's SMPL-H",
-    87: "EasyMocap's SMPL-X",
-    156: "SMPL-H",
-    159: "SMPL-X without the root's frame",
-    165: "SMPL-X",
-}
-
-
-def _pose_hint(array: Array) -> str:
-    """What a pose of another size probably is, and what to take of it."""
-    shape = _without_ones(array.shape)
-    numbers = shape[-2] * 3 if len(shape) > 1 and shape[-1] == 3 else (shape or (1,))[-1]
-    if shape[-2:] == (3, 3):
-        return (
-            "; convert 24 rotations, root first, with matrix_to_axis_angle (concatenate global_orient and body_pose)"
-        )
-    if shape[-1:] == (6,):
-        return "; 6D rotations are turned by six_d_to_matrix and matrix_to_axis_angle"
-    if shape[-1:] == (4,):
-        return "; quaternions are turned into axis-angle first"
-    if numbers == 72:
-        return f"; give one row a call: these are {array.size // 72} frames or persons"
-    if numbers == 69:
-        return "; 69 are SMPL's 23 joints without the root: put global_orient in front"
-    if numbers == 63:
-        return "; 63 are the body of SMPL-X without the root: put global_orient in front, then see from_smplx"
-    if numbers in SMPLX_SIZES:
-        return f"; {numbers} are {SMPLX_SIZES[numbers]}: from_smplx takes the 22 joints that SMPL shares"
-    if array.size in (216, 144, 96):
-        kind = {216: "rotation matrices", 144: "6D rotations", 96: "quaternions"}[array.size]
-        return f"; {array.size} may be 24 {kind}: reshape and convert them"
-    return ""
 
 
 def _betas(betas: Any) -> Array:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ihbench.body.skeleton import pose_hint
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.errors import BadInput
 from ihbench.scene import BodyPose
@@ -40,11 +41,14 @@ def from_zju_root(
 
     Raises `BadInput` when `pose` has another number of entries, or turns the root as well (then Rh is not all of it).
     """
+    shape = np.shape(pose)
     pose = np.asarray(pose, np.float64).reshape(-1)
     if pose.size == 69:
         pose = np.concatenate([np.zeros(3), pose])
     if pose.size != 72:
-        raise BadInput(f"ZJU body pose: expected 72 numbers (or 69 without the root), got {pose.size}")
+        raise BadInput(
+            f"ZJU body pose: expected 72 numbers (or 69 without the root), got {pose.size}{pose_hint(shape)}"
+        )
     if pose[:3].any():
         raise BadInput("ZJU body pose: expected zeros in its first three numbers, because Rh holds the root rotation")
     pose = pose.reshape(24, 3).copy()

@@ -395,6 +395,7 @@ def test_batches_columns_tensors_and_rotation_matrices_are_taken():
     ("pose", "words"),
     [
         (np.zeros(63), "SMPL-X without the root"),
+        (np.zeros(162), "SMPL-X without the root"),
         (np.zeros(66), "GVHMR.*from_smplx"),
         (np.zeros((22, 3)), "GVHMR.*from_smplx"),
         (np.zeros((1, 1, 66)), "from_smplx"),

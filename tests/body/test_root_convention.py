@@ -61,3 +61,11 @@ def test_wrong_pose_layouts_are_bad_input():
         from_zju_root(np.zeros(75), np.zeros(10), zeros, zeros, body)
     with pytest.raises(BadInput, match="Rh holds the root"):
         from_zju_root(np.ones(72), np.zeros(10), zeros, zeros, body)
+
+
+@pytest.mark.parametrize(
+    ("size", "word"), [(66, "GVHMR"), (156, "SMPL-H"), (165, "SMPL-X"), (63, "without the root")]
+)
+def test_a_pose_of_another_body_says_what_it_is(size, word):
+    with pytest.raises(BadInput, match=f"got {size}; {size} are .*{word}"):
+        from_zju_root(np.zeros(size), np.zeros(10), np.zeros(3), np.zeros(3), load_body())
