@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "PPM", "TGA", "GIF")
 MOST_PIXELS = 2**30 // 12  # 9459 px square: what a header may ask for
 PLAIN_GAMMA = (0.42, 0.48)  # of a PNG's gAMA: 1/2.2 by any rounding
+SRGB = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06)  # primaries, x and y
 SAME_COLOUR = 12  # levels by which a profile that calls itself sRGB, or a gamma of 2.2, may differ from it
 SOME = 0.01  # share of pixels that say nothing: renderers clip colours beyond white
 TWELVE_BITS = 4095  # a picture as dark as that in 16 bits holds fewer
@@ -268,7 +269,12 @@ def _refuse(picture: Image.Image, header: dict[Any, Any], name: str, colours_mat
         raise BadInput(
             f"{name}: its colours are not sRGB but {other}; convert it to sRGB and save it without a profile"
         )
-    if not profile and "srgb" not in header and gamma and not PLAIN_GAMMA[0] <= gamma <= PLAIN_GAMMA[1]:
+    if profile or "srgb" in header:
+        return
+    primaries = header.get("chromaticity", ())[2:]  # of a PNG's cHRM, after the white point
+    if len(primaries) == 6 and np.abs(np.subtract(primaries, SRGB)).max() > 0.02:
+        raise BadInput(f"{name}: its primaries are not sRGB's; convert it to sRGB, or remove a wrong cHRM")
+    if gamma and not PLAIN_GAMMA[0] <= gamma <= PLAIN_GAMMA[1]:
         raise BadInput(
             f"{name}: its gamma is {gamma:g} (1 is linear light); expected sRGB, convert it or remove a wrong gAMA"
         )

@@ -115,6 +115,11 @@ RIGHT = {
         RGB,
     ),
     "a gamma of 1/2.2": (lambda p: with_chunk(p, b"gAMA", struct.pack(">I", 45455)), "a.png", RGB),
+    "sRGB's primaries": (
+        lambda p: with_chunk(p, b"cHRM", struct.pack(">8I", 31270, 32900, 64000, 33000, 30000, 60000, 15000, 6000)),
+        "a.png",
+        RGB,
+    ),
     "orientation upright": (lambda p: turned(p, tag=1), "a.png", RGB),
     "upper case": (saved(RGB, format="PNG"), "A.PNG", RGB),
 }
@@ -155,6 +160,11 @@ REFUSED = {
     "mirrored WebP": (lambda p: turned(p, "WEBP", 2), "a.webp", "orientation"),
     "wider colours": (saved(RGB, icc_profile=display_p3()), "a.png", "not sRGB"),
     "a damaged profile": (saved(RGB, icc_profile=b"no profile"), "a.png", "profile that cannot be read"),
+    "wide primaries": (
+        lambda p: with_chunk(p, b"cHRM", struct.pack(">8I", 31270, 32900, 70800, 29200, 17000, 79700, 13100, 4600)),
+        "a.png",
+        "primaries",
+    ),
     "linear light": (lambda p: with_chunk(p, b"gAMA", struct.pack(">I", 100000)), "a.png", "linear light"),
     "white is zero, 16 bits": (saved(DEEP[..., 0], tiffinfo={262: 0}), "a.tif", "inverted"),
     "cut short": (raw(b"\x89PNG\r\n\x1a\n"), "a.png", "cut short"),
