@@ -44,9 +44,10 @@ class BodyPose:
                 (24, 4): "; turn quaternions into axis-angle",
                 (72,): "; pose.reshape(24, 3)",
             }
+            word = words.get(self.pose.shape, OTHER_POSE)
             raise BadValue(
                 f"body pose: expected pose [24, 3], betas [B], transl [3], "
-                f"got {self.pose.shape}, {self.betas.shape}, {self.transl.shape}{words.get(self.pose.shape, OTHER_POSE)}"
+                f"got {self.pose.shape}, {self.betas.shape}, {self.transl.shape}{word}"
             )
         if (np.abs(self.pose) > MOST_RADIANS).any():
             raise BadValue(

@@ -260,9 +260,8 @@ def _pose(pose: Any) -> Array:
         _check_rotations("pose by matrix_to_axis_angle", array)
         return matrix_to_axis_angle(array.reshape(24, 3, 3))
     if shape not in ((72,), (24, 3)):
-        raise BadInput(
-            f"pose: expected 72 numbers of axis-angle, [72] or [24, 3], got {list(array.shape)}{pose_hint(array.shape)}"
-        )
+        hint = pose_hint(array.shape)
+        raise BadInput(f"pose: expected 72 numbers of axis-angle, [72] or [24, 3], got {list(array.shape)}{hint}")
     return array.reshape(24, 3)
 
 

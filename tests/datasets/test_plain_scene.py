@@ -413,7 +413,9 @@ NAN_POSE[1, 5] = np.nan
     [
         ({"pose": None}, "no array 'pose'"),
         ({"transl": None}, "no array 'transl'"),
-        ({"pose": np.zeros((3, 69))}, r"\[N, 72\]"),
+        ({"pose": np.zeros((3, 69))}, r"\[N, 72\].*without the root"),
+        ({"pose": np.zeros((3, 165))}, r"\[N, 72\].*165 are SMPL-X"),
+        ({"pose": np.zeros((3, 22, 3))}, r"\[N, 72\].*66 are SMPL-X"),
         ({"pose": np.zeros(72)}, r"\[N, 72\]"),
         ({"pose": np.zeros((0, 72))}, r"\[N, 72\]"),
         ({"pose": NAN_POSE}, "NaN or infinity in row 1"),
@@ -801,10 +803,17 @@ def test_the_examples_of_the_page_run(tmp_path, own_body):
         row |= {"box": (32, 24, 40), "poses": pose.reshape(1, 72) * (np.arange(72) > 2), "Rh": pose[:1]}
         row |= {"Th": np.array([[0, 0, 3.0]]) - axis_angle_to_matrix(pose[0]) @ pelvis}
         R, t = look_at([0, 0, 3], [0, 0, 0])
-        calibration = {"K": np.array([[45, 0, 31.5], [0, 45, 23.5], [0, 0, 1]]), "R": np.eye(3), "T": np.zeros(3)}
+        calibration = {
+            "K": np.array([[45, 0, 31.5], [0, 45, 23.5], [0, 0, 1]]),
+            "R": np.eye(3),
+            "T": np.zeros((3, 1)),
+        }
         known = {"folder": tmp_path / kind, "width": WIDTH, "height": HEIGHT, "focal": 45.0, "body": body}
         known |= {"hmr": [row], "incam": [row], "world": [row], "easymocap": [row], "R_w2c": R, "t_w2c": t}
-        known |= {"K": calibration["K"], "calibration": {"main": calibration | {"dist": np.zeros(5)}}}
+        known |= {
+            "K": calibration["K"],
+            "calibration": {"main": calibration | {"dist": np.zeros((1, 5))}, "basenames": ["main"]},
+        }
         known["images"] = [np.zeros((HEIGHT, WIDTH, 3), np.uint8)]
         exec("from ihbench.datasets import plain_scene\n" + example, known)
         plain_scene.write_body_file(known["folder"], body)
