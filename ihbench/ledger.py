@@ -21,6 +21,7 @@ import numpy as np
 
 from ihbench import machine
 from ihbench.atomic import decode, encode, write_bytes
+from ihbench.files.regular import read_bytes
 
 if TYPE_CHECKING:
     from ihbench.progress import Progress
@@ -258,7 +259,7 @@ class Ledger:
                 if not file.exists():
                     return None
                 try:
-                    tensors, record = _unpack(file.read_bytes())
+                    tensors, record = _unpack(read_bytes(file))
                     clocks = _stages(record["clock"])
                 except Exception as error:  # whatever a damaged file makes of the reader: the stage starts again
                     self.event("warning", what=f"checkpoint {name} is damaged, starting that stage again: {error}")
@@ -373,7 +374,7 @@ def _root(path: str) -> str:
 
 def saved_meta(file: Path) -> dict[str, Any]:
     """The meta of a saved state's file. Raises `ValueError`, or what the reader raises, when it is damaged."""
-    return decode(_unpack(file.read_bytes())[1]["meta"])
+    return decode(_unpack(read_bytes(file))[1]["meta"])
 
 
 def _copies(tensors: Mapping[str, Any]) -> dict[str, Any]:

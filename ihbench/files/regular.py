@@ -12,22 +12,30 @@ from ihbench.errors import BadInput
 LARGEST_TEXT = 2**28  # bytes; of files that are text
 
 
-def opened(path: str | Path, what: str = "a file") -> BinaryIO:
-    """The file, open for reading. Raises `BadInput` for one that cannot be opened and for what is no ordinary file.
+def regular_file(path: str | Path, what: str = "a file") -> Path:
+    """The path itself. Raises `BadInput` where nothing is, and where it is no ordinary file.
 
     `what` says what was expected, such as "a protocol file".
     """
     path = Path(path)
     try:
         mode = os.stat(path).st_mode
-        if not stat.S_ISREG(mode):
-            kind = "a folder" if stat.S_ISDIR(mode) else "a device, a pipe or a socket"
-            raise BadInput(f"{path}: {kind}; expected {what}")
-        return open(path, "rb")
     except OSError as error:
         raise BadInput(f"{path}: cannot be opened ({error.strerror}); expected {what}, check the path") from error
     except ValueError as error:  # a zero byte in the name
         raise BadInput(f"{os.fspath(path)!r}: no possible path ({error}); expected {what}") from error
+    if not stat.S_ISREG(mode):
+        kind = "a folder" if stat.S_ISDIR(mode) else "a device, a pipe or a socket"
+        raise BadInput(f"{path}: {kind}; expected {what}")
+    return path
+
+
+def opened(path: str | Path, what: str = "a file") -> BinaryIO:
+    """The file, open for reading. Raises `BadInput` as `regular_file`, and for one that cannot be opened."""
+    try:
+        return open(regular_file(path, what), "rb")
+    except OSError as error:
+        raise BadInput(f"{path}: cannot be opened ({error.strerror}); expected {what}, check the path") from error
 
 
 def read_bytes(path: str | Path, what: str = "a file", most: int | None = None) -> bytes:
