@@ -253,21 +253,21 @@ class Ledger:
                 if name not in self._in_memory:
                     return None
                 tensors, record = self._in_memory[name]
-                tensors, clocks = _copies(tensors), _stages(record["clock"])
+                tensors, clocks, meta = _copies(tensors), _stages(record["clock"]), decode(record["meta"])
             else:
                 file = self._state_path(name)
                 if not file.exists():
                     return None
                 try:
                     tensors, record = _unpack(read_bytes(file))
-                    clocks = _stages(record["clock"])
+                    clocks, meta = _stages(record["clock"]), decode(record["meta"])
+                    events = list(decode(record["events"])) if record.get("of") == self.folder.name else []
                 except Exception as error:  # whatever a damaged file makes of the reader: the stage starts again
                     self.event("warning", what=f"checkpoint {name} is damaged, starting that stage again: {error}")
                     return None
-                if record.get("of") == self.folder.name:
-                    self._recall(decode(record["events"]))
+                self._recall(events)
         self._go_on_from(clocks)
-        return tensors, decode(record["meta"])
+        return tensors, meta
 
     def _recall(self, events: list[dict[str, Any]]) -> None:
         """Put events of an earlier process, as far as they are not known, before those of this one."""

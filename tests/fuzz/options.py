@@ -317,11 +317,12 @@ def attack(world: World, words: list[str], value: str) -> Iterator[str]:
         except ValueError:
             if lines or status == 2:
                 yield f"--json, but stdout is not one object: {text[:100]!r}"
-    yield from _changes(world, before, status, value)
+    yield from _changes(world, before, status, value, worked="cut short" in told)
 
 
-def _changes(world: World, before: dict[str, Any], status: int | None, value: str) -> Iterator[str]:
-    """What the command removed, changed, or left although it was refused; then everything is as it was."""
+def _changes(world: World, before: dict[str, Any], status: int | None, value: str, worked: bool) -> Iterator[str]:
+    """What the command removed, changed, or left although it was refused before it `worked`; then everything is as it
+    was."""
     after = world.seen()
     for name, content in before.items():
         if after.get(name) == content:
@@ -336,7 +337,7 @@ def _changes(world: World, before: dict[str, Any], status: int | None, value: st
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content[1])
     new = sorted(name for name in after if name not in before)
-    if status == 2:
+    if status == 2 and not worked:
         kept = [name for name in new if not name.endswith(("runs.sqlite", "lock"))]
         if kept:
             yield f"refused, but left {', '.join(kept[:5])}"
