@@ -31,7 +31,7 @@ def identity() -> dict[str, Any]:
         "torch": str(torch.__version__) if torch is not None else None,
         "torch_threads": torch.get_num_threads() if torch is not None else None,
         "gpu": sys.modules["torch"].cuda.get_device_name() if _cuda_in_use() else None,
-        "load_average": [round(value, 2) for value in os.getloadavg()] if hasattr(os, "getloadavg") else None,
+        "load_average": load_average(),
     }
 
 
@@ -44,10 +44,18 @@ def identity_at_end(before: dict[str, Any]) -> dict[str, Any]:
     return now | {"load_average": before.get("load_average"), "load_average_end": now["load_average"]}
 
 
+def load_average() -> list[float] | None:
+    """Processes that wanted to run over the last 1, 5 and 15 minutes; None where the system does not say."""
+    try:
+        return [round(value, 2) for value in os.getloadavg()]
+    except (OSError, AttributeError):  # sandboxes, Windows
+        return None
+
+
 def cpu_model() -> str:
     """The processor's name, as the system tells it."""
     try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
+        for line in Path("/proc/cpuinfo").read_text(errors="replace").splitlines():
             if line.startswith("model name"):
                 return line.split(":", 1)[1].strip()
     except OSError:
@@ -57,9 +65,10 @@ def cpu_model() -> str:
 
 def usable_cores() -> int:
     """Cores this process may run on; fewer than the machine has under taskset or a batch system."""
-    if hasattr(os, "sched_getaffinity"):
+    try:
         return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    except (OSError, AttributeError):  # sandboxes, Windows
+        return os.cpu_count() or 1
 
 
 def memory_gb() -> float | None:
@@ -100,7 +109,7 @@ def reset_peak_memory() -> bool:
 def process_memory_mb(field: str) -> float | None:
     """MiB of a field of /proc/self/status ("VmRSS" now, "VmHWM" at most); None where there is no such file."""
     try:
-        for line in Path("/proc/self/status").read_text().splitlines():
+        for line in Path("/proc/self/status").read_text(errors="replace").splitlines():
             if line.startswith(field + ":"):
                 return int(line.split()[1]) / 2**10
     except OSError:

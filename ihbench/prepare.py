@@ -115,9 +115,16 @@ def prepare(
 
 def _remove_leftovers(out: Path, name: str) -> None:
     """Remove what earlier calls left that were killed; what is being written now is locked."""
-    for lock in out.glob(f".{escape(name)}.{8 * '[0-9a-f]'}.lock"):
-        if not locks.is_held(lock):
-            removal.discard(lock.with_suffix(".partial"))
+    for left in out.glob(f".{escape(name)}.{8 * '[0-9a-f]'}.*"):
+        lock = left.with_suffix(".lock")
+        if left.suffix not in (".partial", ".before", ".lock") or locks.is_held(lock):
+            continue
+        if left.suffix == ".partial":
+            removal.discard(left)
+        elif left.suffix == ".before" and not _not_ours(left):
+            removal.remove_written(left, _written_there(left))
+            removal.discard(left)
+        elif left.suffix == ".lock":
             removal.discard_file(lock)
 
 

@@ -94,3 +94,18 @@ def test_versions_are_those_of_the_installed_packages():
     versions = provenance.package_versions()
     assert versions["numpy"] == np.__version__
     assert "gsplat" not in versions or versions["gsplat"]
+
+
+def test_a_system_that_tells_nothing_is_no_error(monkeypatch):
+    """Sandboxes hide the load, the affinity, /proc."""
+
+    def refuses(*_, **__):
+        raise OSError("not here")
+
+    for name in ("getloadavg", "sched_getaffinity"):
+        monkeypatch.setattr(machine.os, name, refuses, raising=False)
+    monkeypatch.setattr(machine.Path, "read_text", refuses)
+    about = machine.identity()
+    assert about["load_average"] is None
+    assert about["cores_usable"] >= 1
+    assert about["cpu"]

@@ -74,8 +74,11 @@ def test_a_record_that_cannot_be_written_is_said_and_the_first_reason_counts(tmp
 
 
 def test_a_finished_run_is_found_where_nothing_may_be_written(tmp_path, monkeypatch):
-    folder = RunFolder.create(tmp_path, IDENTITY, {"standin": "", "variant": ""})
-    folder.write_scores([{"row": "inpainthuman", "camera": "1", "frame": 0, "scores": {"a": 1.0}, "absent": {}}])
+    about = {"standin": "", "variant": "", "headline": "body", "changed": [], "left_out": []}
+    about |= {"fit_seconds": 1.0, "total_seconds": 1.0, "peak_mb": 1.0}
+    folder = RunFolder.create(tmp_path, IDENTITY, about)
+    scores = {"psnr/pooled/range1/full/v1": 30.0}
+    folder.write_scores([{"row": "inpainthuman", "camera": "1", "frame": 0, "scores": scores, "absent": {}}])
     folder.set_status("done")
 
     def read_only(*_, **__):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import json
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -46,7 +47,6 @@ def test_only_one_module_removes():
                     found.setdefault(path.relative_to(ROOT).as_posix(), set()).add(name)
     assert found == {
         "ihbench/atomic.py": {"os.replace"},
-        "ihbench/index.py": {"os.replace"},
         "ihbench/locks.py": {"os.rename", "unlink"},
         "ihbench/prepare.py": {"os.rename", "rmdir"},
         "ihbench/removal.py": {"os.replace", "rmdir", "shutil.rmtree", "unlink"},
@@ -160,15 +160,17 @@ def test_the_current_folder_is_not_taken_away(scene, tmp_path, monkeypatch):
 
 def test_what_killed_calls_left_goes_and_what_looks_like_it_stays(scene, tmp_path):
     name = scene.capture.name
-    for word, kept in (("0123abcd", False), ("held0000", True), ("mine", True)):
-        partial = tmp_path / f".{name}.{word}.partial"
-        partial.mkdir()
-        (partial / "file").touch()
-        if not kept:
-            (tmp_path / f".{name}.{word}.lock").touch()
+    handed(scene, tmp_path / "elsewhere")
+    strangers = [
+        f".{name}.{word}" for word in ("mine.partial", "0123abcx.partial", "0123abcd.notes", "00000001.before")
+    ]
+    for part in (f".{name}.0123abcd.partial", *strangers):
+        (tmp_path / part).mkdir()
+        (tmp_path / part / "file").touch()
+    (tmp_path / f".{name}.0123abcd.lock").touch()
+    shutil.copytree(tmp_path / "elsewhere" / name, tmp_path / f".{name}.00000002.before")  # killed while replacing
     handed(scene, tmp_path)
-    left = {path.name for path in tmp_path.iterdir()}
-    assert left == {name, f".{name}.held0000.partial", f".{name}.mine.partial"}
+    assert {path.name for path in tmp_path.iterdir()} == {name, "elsewhere", *strangers}
     with locks.locked(tmp_path / f".{name}.0123abcd.lock", ""):
         (tmp_path / f".{name}.0123abcd.partial").mkdir()
         handed(scene, tmp_path, True)

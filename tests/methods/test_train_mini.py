@@ -155,6 +155,16 @@ def test_the_loss_sees_the_prompted_traits(tmp_path, album):
     assert torch.equal(both[0], both[1])
 
 
+def test_an_album_is_made_where_processes_cannot_share_memory(tmp_path, monkeypatch):
+    def refuses(*_, **__):
+        raise OSError(38, "Function not implemented")
+
+    monkeypatch.setattr(crop_album, "ProcessPoolExecutor", refuses)
+    store = CropAlbum(tmp_path, "procedural", 2, SIDE)
+    store.make(0, 2, QUIET)
+    assert len(list(store.pages(0, 2))) == 1
+
+
 def test_album_pages_are_written_whole_and_read_back(tmp_path):
     store = CropAlbum(tmp_path, "procedural", 2, SIDE)
     store.make(0, 2, QUIET)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -83,11 +84,17 @@ class CropAlbum:
         missing = [s for s in range(start, start + count, PAGE) if not self.path(s).is_file()]
         if not missing:
             return
-        with progress.task("photographing people", len(missing) * PAGE) as task:
-            work = [(self.people, s, self.each, self.size, self.path(s)) for s in missing]
-            with ProcessPoolExecutor(min(os.cpu_count() or 1, len(missing)), initializer=end_with_parent) as pool:
-                for _ in pool.map(_write_page, work):
-                    task.advance(PAGE)
+        work = [(self.people, s, self.each, self.size, self.path(s)) for s in missing]
+        with progress.task("photographing people", len(missing) * PAGE) as task, ExitStack() as stack:
+            try:
+                workers = min(os.cpu_count() or 1, len(missing))
+                pool = stack.enter_context(ProcessPoolExecutor(workers, initializer=end_with_parent))
+            except (OSError, ImportError, NotImplementedError):  # no shared memory here, as in some sandboxes
+                written = map(_write_page, work)
+            else:
+                written = pool.map(_write_page, work)
+            for _ in written:
+                task.advance(PAGE)
 
     def pages(self, start: int, count: int) -> Iterator[Page]:
         for s in range(start, start + count, PAGE):
