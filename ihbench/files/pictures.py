@@ -26,6 +26,8 @@ FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "PPM", "TGA", "GIF")
 MOST_PIXELS = 2**30 // 12  # 9459 px square: what a header may ask for
 PLAIN_GAMMA = (0.42, 0.48)  # of a PNG's gAMA: 1/2.2 by any rounding
 SRGB = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06)  # primaries, x and y
+WIDE = {9: "BT.2020", 11: "DCI-P3", 12: "Display P3"}  # primaries, by their number in ITU-T H.273
+HIGH_RANGE = {8: "linear light", 16: "HDR (PQ)", 18: "HDR (HLG)"}  # transfer functions, likewise
 SAME_COLOUR = 12  # levels by which a profile that calls itself sRGB, or a gamma of 2.2, may differ from it
 SOME = 0.01  # share of pixels that say nothing: renderers clip colours beyond white
 TWELVE_BITS = 4095  # a picture as dark as that in 16 bits holds fewer
@@ -193,6 +195,8 @@ def read_picture(path: Path, name: str = "", colours_matter: bool = True) -> Pic
             ) from error
         if frames > 1:
             raise BadInput(f"{name}: holds {frames} pictures; expected one, save each as a file of its own")
+        if picture.format == "PNG":
+            header["cicp"] = _code_points(path)
         _refuse(picture, header, name, colours_matter)
         lossy = _lossy(picture, path)
         if picture.mode in ("RGB", "RGBA", "LA") and any(";16" in tile for tile in tiles):
@@ -265,19 +269,40 @@ def _refuse(picture: Image.Image, header: dict[Any, Any], name: str, colours_mat
     if not colours_matter:
         return
     profile, gamma = header.get("icc_profile"), header.get("gamma")
+    primaries, transfer = header.get("cicp", (2, 2))
+    if primaries in WIDE or transfer in HIGH_RANGE:
+        raise BadInput(
+            f"{name}: its colours are {WIDE.get(primaries, 'sRGB')}, {HIGH_RANGE.get(transfer, 'standard range')}; "
+            f"expected sRGB, convert the video or the picture to it"
+        )
     if profile and (other := _other_colours(bytes(profile))):
         raise BadInput(
             f"{name}: its colours are not sRGB but {other}; convert it to sRGB and save it without a profile"
         )
     if profile or "srgb" in header:
         return
-    primaries = header.get("chromaticity", ())[2:]  # of a PNG's cHRM, after the white point
-    if len(primaries) == 6 and np.abs(np.subtract(primaries, SRGB)).max() > 0.02:
+    corners = header.get("chromaticity", ())[2:]  # of a PNG's cHRM, after the white point
+    if len(corners) == 6 and np.abs(np.subtract(corners, SRGB)).max() > 0.02:
         raise BadInput(f"{name}: its primaries are not sRGB's; convert it to sRGB, or remove a wrong cHRM")
     if gamma and not PLAIN_GAMMA[0] <= gamma <= PLAIN_GAMMA[1]:
         raise BadInput(
             f"{name}: its gamma is {gamma:g} (1 is linear light); expected sRGB, convert it or remove a wrong gAMA"
         )
+
+
+def _code_points(path: Path) -> tuple[int, int]:
+    """(primaries, transfer) of a PNG's cICP, as ffmpeg writes it, by ITU-T H.273; (2, 2), unknown, without."""
+    with open(path, "rb") as file:
+        file.seek(8)
+        while len(head := file.read(8)) == 8:
+            length, kind = int.from_bytes(head[:4], "big"), head[4:]
+            if kind == b"IDAT":
+                break
+            if kind == b"cICP":
+                content = file.read(2)
+                return (content[0], content[1]) if len(content) == 2 else (2, 2)
+            file.seek(length + 4, 1)
+    return 2, 2
 
 
 def _orientation(picture: Image.Image, header: dict[Any, Any]) -> int:

@@ -120,6 +120,7 @@ RIGHT = {
         "a.png",
         RGB,
     ),
+    "video of standard range": (lambda p: with_chunk(p, b"cICP", bytes([1, 1, 0, 1])), "a.png", RGB),
     "orientation upright": (lambda p: turned(p, tag=1), "a.png", RGB),
     "upper case": (saved(RGB, format="PNG"), "A.PNG", RGB),
 }
@@ -165,6 +166,7 @@ REFUSED = {
         "a.png",
         "primaries",
     ),
+    "HDR video": (lambda p: with_chunk(p, b"cICP", bytes([9, 18, 0, 1])), "a.png", r"BT\.2020, HDR \(HLG\)"),
     "linear light": (lambda p: with_chunk(p, b"gAMA", struct.pack(">I", 100000)), "a.png", "linear light"),
     "white is zero, 16 bits": (saved(DEEP[..., 0], tiffinfo={262: 0}), "a.tif", "inverted"),
     "cut short": (raw(b"\x89PNG\r\n\x1a\n"), "a.png", "cut short"),
