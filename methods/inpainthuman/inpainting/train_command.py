@@ -46,7 +46,7 @@ def _train(chosen: Any) -> dict[str, Any]:
     from ihbench.data_source import cache_folder
     from ihbench.locks import locked
     from ihbench.methods.inpainthuman.inpainting.mini_card import write_card
-    from ihbench.methods.inpainthuman.inpainting.mini_folder import SHIPPED
+    from ihbench.methods.inpainthuman.inpainting.mini_folder import SHIPPED, check_mini
     from ihbench.methods.inpainthuman.inpainting.mini_validation import validate
     from ihbench.methods.inpainthuman.inpainting.mini_weights import save_mini
     from ihbench.methods.inpainthuman.inpainting.train_mini import MiniTrainer
@@ -57,6 +57,8 @@ def _train(chosen: Any) -> dict[str, Any]:
         raise BadInput(f"--out {chosen.out}: holds the shipped backbone; train in a folder of your own")
     if chosen.start is not None and removal.holds(chosen.start, chosen.out):
         raise BadInput(f"--out {chosen.out}: holds the backbone to start from; train in a folder of your own")
+    if chosen.start is not None:
+        check_mini(chosen.start)  # before hours of photographs
     _check_out(chosen.out)
     album = chosen.album or cache_folder() / "album"
     # a GPU waits for one process that draws occluders; on the CPU more processes would only take from each other
