@@ -62,7 +62,8 @@ def locked(
 
 
 def is_held(file: Path) -> bool:
-    """Whether somebody holds the lock. In a place that may not be written nobody here does."""
+    """Whether somebody holds the lock, as far as can be seen from here: the locks of some file systems are not seen
+    on other machines, but who holds renews its name. In a place that may not be written nobody here does."""
     if not os.path.exists(file) and not os.path.exists(_owner_file(file)):
         return False
     try:
@@ -70,9 +71,12 @@ def is_held(file: Path) -> bool:
         if not _acquired(lock):
             return True
         lock.release()
-        return False
     except (OSError, NotImplementedError):
         return not _abandoned(file)
+    with suppress(OSError):
+        owner = _read_owner(file)
+        return owner is not None and owner["place"] != _here()["place"] and not _abandoned(file)
+    return False
 
 
 def _taken(file: Path) -> Callable[[], None] | None:
@@ -85,12 +89,13 @@ def _taken(file: Path) -> Callable[[], None] | None:
         if isinstance(error, OSError) and error.errno not in NO_LOCKS:
             raise
         return _claimed(file)
-    with suppress(OSError):  # the lock holds without it
-        _write_owner(_owner_file(file), os.O_TRUNC)
+    try:
+        forget = _kept_up(_owner_file(file), _write_owner(_owner_file(file), os.O_TRUNC))
+    except OSError:  # the lock holds without it
+        return lock.release
 
     def release() -> None:
-        with suppress(OSError):
-            _owner_file(file).unlink()
+        forget()
         lock.release()
 
     return release
@@ -115,8 +120,19 @@ def _acquired(lock: Any) -> bool:
     try:
         lock.acquire()
     except filelock.Timeout:
+        _check_locks(lock.lock_file)
         return False
     return True
+
+
+def _check_locks(file: str) -> None:
+    """Raise `OSError` where the file system has no locks: early versions of filelock say that somebody holds."""
+    try:
+        import fcntl
+    except ImportError:
+        return
+    with suppress(BlockingIOError, PermissionError), open(file, "rb") as stream:
+        fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
 
 
 # --- claims ---
@@ -133,22 +149,27 @@ def _claimed(file: Path) -> Callable[[], None] | None:
         mine = _write_owner(claim, os.O_EXCL)
     except FileExistsError:
         return None
+    return _kept_up(claim, mine)
+
+
+def _kept_up(owner: Path, mine: str) -> Callable[[], None]:
+    """Renew what says that this process holds, for those who cannot see that it lives, until the result is called."""
     over = threading.Event()
 
     def renew() -> None:
         while not over.wait(RENEWAL):
             with suppress(OSError):
-                os.utime(claim)
+                os.utime(owner)
 
-    threading.Thread(target=renew, name="claim", daemon=True).start()
+    threading.Thread(target=renew, name="lock", daemon=True).start()
 
-    def release() -> None:
+    def forget() -> None:
         over.set()
         with suppress(OSError):
-            if claim.read_text(encoding="utf-8") == mine:  # not one that took over
-                claim.unlink()
+            if owner.read_text(encoding="utf-8") == mine:  # not one that took over
+                owner.unlink()
 
-    return release
+    return forget
 
 
 def _take_away(claim: Path) -> None:
