@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from ihbench import atomic
@@ -9,9 +12,12 @@ from ihbench.body import Body, load_body
 from ihbench.datasets.standin.subject import Subject
 from ihbench.datasets.standin_mark import STANDIN_FILE
 from ihbench.errors import BadInput
+from ihbench.locks import locked
 from ihbench.paths import user_path
+from ihbench.progress import Progress
 
 NAME_PREFIX = "standin-"
+ADVICE = "choose another folder (--out, IHBENCH_CACHE)"
 
 
 def cast_names(count: int) -> list[str]:
@@ -55,9 +61,24 @@ def claim(root: Path, version: int, seed: int, body: Body) -> None:
         if found != mark:
             raise BadInput(f"{root}: holds another stand-in ({_differences(found, mark)}); choose another folder")
         return
-    if root.exists() and (not root.is_dir() or any(root.iterdir())):
+    if root.exists() and (not root.is_dir() or any(not _is_litter(entry.name) for entry in root.iterdir())):
         raise BadInput(f"{root}: not an empty folder and not a stand-in; choose another folder")
-    atomic.write_json(path, mark)
+    with locked(root / f".{STANDIN_FILE}.lock", ADVICE):
+        if not path.is_file():
+            atomic.write_json(path, mark)
+    claim(root, version, seed, body)  # somebody else may have been quicker
+
+
+def _is_litter(name: str) -> bool:
+    """Whether a name is of those that locks, halves of files and file browsers leave."""
+    return name.startswith((f".{STANDIN_FILE}", f".{NAME_PREFIX}", ".DS_Store")) or name.lower() == "thumbs.db"
+
+
+@contextmanager
+def alone_with(root: Path, name: str, progress: Progress) -> Iterator[None]:
+    """Hold one person of a cast while the files are made. A second process waits, then finds them there."""
+    with locked(root / f".{name}.lock", ADVICE, wait=math.inf, on_wait=progress.say):
+        yield
 
 
 def _differences(found: object, asked: dict[str, object]) -> str:

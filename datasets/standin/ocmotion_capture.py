@@ -18,7 +18,7 @@ from ihbench import atomic
 from ihbench.camera import Camera, look_at
 from ihbench.datasets import ocmotion_w2a
 from ihbench.datasets.standin import motion
-from ihbench.datasets.standin.cast import cast_names, open_cast
+from ihbench.datasets.standin.cast import alone_with, cast_names, open_cast
 from ihbench.datasets.standin.furniture import furnish, furniture_view
 from ihbench.datasets.standin.photograph import photograph
 from ihbench.datasets.standin.studio import empty_studio
@@ -66,7 +66,9 @@ class OcMotionStandIn:
         root, people = open_cast(root, VERSION, seed, subjects)
         progress = progress or Progress.silent()
         for name, person in zip(subjects, people, strict=True):
-            _ensure_sequence(root / name, name, person, progress)
+            if _missing(root / name):
+                with alone_with(root, name, progress):
+                    _ensure_sequence(root / name, name, person, progress)
         return root
 
 
@@ -85,18 +87,24 @@ def room_cameras(rng: np.random.Generator) -> list[Camera]:
     return cameras
 
 
+def _missing(folder: Path) -> list[int]:
+    """The frames that are not there yet."""
+    last = (folder / "truth" / "masks" / f"{frame:05d}.png" for frame in range(N_FRAMES))
+    return [frame for frame, path in enumerate(last) if not path.is_file()]
+
+
 def _ensure_sequence(folder: Path, name: str, subject: Subject, progress: Progress) -> None:
     names = [f"{frame:05d}" for frame in range(N_FRAMES)]
-    missing = [k for k in range(N_FRAMES) if not (folder / "truth" / "masks" / f"{names[k]}.png").is_file()]
+    missing = _missing(folder)
+    if not missing:  # another process has made them meanwhile
+        return
     show = motion.stroll(subject.rng("stroll"), N_FRAMES, REACH)
     poses = motion.body_poses(show, subject.betas, subject.body)
     cameras = room_cameras(subject.rng("room"))
-    if not (folder / "metadata.json").is_file():
-        ocmotion_w2a.write_sequence_metadata(folder, names, cameras[0], poses)
+    if not (folder / ocmotion_w2a.METADATA).is_file():
         ocmotion_w2a.write_mesh_infos(folder, names, poses, subject.body)
         ocmotion_w2a.write_all_cameras(folder, names, cameras)
-    if not missing:
-        return
+        ocmotion_w2a.write_sequence_metadata(folder, names, cameras[0], poses)  # is last: it stands for all three
     room = empty_studio(cameras[0], subject.studio_seed)
     furniture = furniture_view(furnish(subject.rng("furniture")), subject.lighting, cameras[0], room)
 
@@ -122,6 +130,9 @@ def _ensure_sequence(folder: Path, name: str, subject: Subject, progress: Progre
     with progress.task(f"filming {name}", total=len(missing)) as task:
         write(missing[0])  # computes what the threads share before they start
         task.advance()
-        with ThreadPoolExecutor((os.cpu_count() or 1) + 1) as pool:
+        pool = ThreadPoolExecutor((os.cpu_count() or 1) + 1)
+        try:
             for _ in pool.map(write, missing[1:]):
                 task.advance()
+        finally:
+            pool.shutdown(cancel_futures=True)

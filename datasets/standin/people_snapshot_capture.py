@@ -19,7 +19,7 @@ from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera, look_at
 from ihbench.datasets import people_snapshot
 from ihbench.datasets.standin import motion
-from ihbench.datasets.standin.cast import cast_names, open_cast
+from ihbench.datasets.standin.cast import alone_with, cast_names, open_cast
 from ihbench.datasets.standin.photograph import Photograph, photograph
 from ihbench.datasets.standin.studio import empty_studio
 from ihbench.datasets.standin.subject import Subject
@@ -67,8 +67,11 @@ class PeopleSnapshotStandIn:
         root, people = open_cast(root, VERSION, seed, subjects)
         progress = progress or Progress.silent()
         for name, person in zip(subjects, people, strict=True):
-            if not (root / name / "reconstructed_poses.hdf5").is_file():  # is written last
-                _write_subject(root / name, name, person, progress)
+            last = root / name / people_snapshot.POSES_FILE
+            if not last.is_file():
+                with alone_with(root, name, progress):
+                    if not last.is_file():
+                        _write_subject(root / name, name, person, progress)
         return root
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.datasets import zju_mocap
-from ihbench.datasets.standin.cast import cast_names, open_cast
+from ihbench.datasets.standin.cast import alone_with, cast_names, open_cast
 from ihbench.datasets.standin.motion import N_FRAMES, NOVEL_FRAMES
 from ihbench.datasets.standin.photograph import photograph
 from ihbench.datasets.standin.rig import N_CAMERAS
@@ -63,7 +63,10 @@ class ZjuStandIn:
         root, people = open_cast(root, VERSION, seed, subjects)
         progress = progress or Progress.silent()
         for name, person in zip(subjects, people, strict=True):
-            _ensure_subject(root / f"{zju_mocap.FOLDER_PREFIX}{name}", name, person, frames_of, progress)
+            folder = root / f"{zju_mocap.FOLDER_PREFIX}{name}"
+            if _missing(folder, frames_of) is not None:
+                with alone_with(root, name, progress):
+                    _ensure_subject(folder, name, person, frames_of, progress)
         return root
 
 
@@ -79,16 +82,10 @@ def _check_wanted(frames_of: dict[int, list[int]]) -> None:
 def _ensure_subject(
     folder: Path, name: str, subject: Subject, frames_of: dict[int, list[int]], progress: Progress
 ) -> None:
-    paths = zju_mocap.standard_image_paths(N_CAMERAS, ALL_FRAMES)
-    wanted_frames = sorted({frame for frames in frames_of.values() for frame in frames})
-    pictures = [
-        (camera, frame)
-        for camera, frames in frames_of.items()
-        for frame in frames
-        if not _all_there(folder, paths[frame][camera])
-    ]
-    vertices = [frame for frame in wanted_frames if not (folder / "new_vertices" / f"{frame}.npy").is_file()]
-    params = [frame for frame in range(ALL_FRAMES) if not (folder / "new_params" / f"{frame}.npy").is_file()]
+    missing = _missing(folder, frames_of)
+    if missing is None:  # another process has made them meanwhile
+        return
+    paths, pictures, vertices, params = missing
 
     @lru_cache(maxsize=128)
     def clothed(frame: int) -> NDArray[np.float64]:
@@ -128,6 +125,25 @@ def _ensure_subject(
                 task.advance()
         finally:
             pool.shutdown(cancel_futures=True)
+
+
+Missing = tuple[list[list[str]], list[tuple[int, int]], list[int], list[int]]
+
+
+def _missing(folder: Path, frames_of: dict[int, list[int]]) -> Missing | None:
+    """(image paths by frame and camera, pictures, frames of vertices, of parameters) to make; None for nothing."""
+    paths = zju_mocap.standard_image_paths(N_CAMERAS, ALL_FRAMES)
+    wanted_frames = sorted({frame for frames in frames_of.values() for frame in frames})
+    pictures = [
+        (camera, frame)
+        for camera, frames in frames_of.items()
+        for frame in frames
+        if not _all_there(folder, paths[frame][camera])
+    ]
+    vertices = [frame for frame in wanted_frames if not (folder / "new_vertices" / f"{frame}.npy").is_file()]
+    params = [frame for frame in range(ALL_FRAMES) if not (folder / "new_params" / f"{frame}.npy").is_file()]
+    there = (folder / "annots.npy").is_file() and not (pictures or vertices or params)
+    return None if there else (paths, pictures, vertices, params)
 
 
 def _all_there(folder: Path, image_path: str) -> bool:

@@ -58,7 +58,8 @@ def cast(body):
 
 
 def files_below(root):
-    return {path.relative_to(root).as_posix(): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+    files = (path for path in root.rglob("*") if path.is_file() and not path.name.endswith(".lock"))
+    return {path.relative_to(root).as_posix(): path.read_bytes() for path in files}
 
 
 # ------------------------------------------------------------------------------------------- the files

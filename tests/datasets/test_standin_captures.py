@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
+import time
 
 import h5py
 import numpy as np
@@ -257,3 +260,106 @@ def test_the_video_is_close_to_what_was_filmed(tmp_path, monkeypatch):
         assert quality[k] > 25
         assert quality[k] == max(quality)
         assert psnr(capture.image(0, k)[..., ::-1], filmed[k]) < quality[k] - 5  # RGB, not BGR
+
+
+MAKERS = {
+    "zju_mocap": ("zju_capture.ZjuStandIn.ensure(root, seed, ['standin-1'], {0: [0, 100], 7: [0]})", "zju_capture"),
+    "ocmotion": (
+        "ocmotion_capture.N_FRAMES, ocmotion_capture.WIDTH, ocmotion_capture.HEIGHT = 4, 240, 180\n"
+        "ocmotion_capture.OcMotionStandIn.ensure(root, seed, ['standin-1'], {})",
+        "ocmotion_capture",
+    ),
+    "people_snapshot": (
+        "people_snapshot_capture.N_FRAMES, people_snapshot_capture.SIZE = 4, 180\n"
+        "people_snapshot_capture.PeopleSnapshotStandIn.ensure(root, seed, ['standin-1'], {})",
+        "people_snapshot_capture",
+    ),
+}
+PRELUDE = """
+import sys, time
+from pathlib import Path
+from ihbench.datasets.standin import {module}
+from ihbench.errors import BadInput
+from ihbench.progress import Progress
+root, seed, gate = Path(sys.argv[1]), int(sys.argv[2]), Path(sys.argv[3])
+(gate / str(time.monotonic_ns())).touch()
+while len(list(gate.iterdir())) < int(sys.argv[4]):
+    time.sleep(0.001)
+try:
+    {call}
+except BadInput as error:
+    print(error)
+    sys.exit(2)
+"""
+
+
+def _start(call, module, root, gate, seeds, together):
+    code = PRELUDE.format(module=module, call=call.replace("\n", "\n    "))
+    return [
+        subprocess.Popen(
+            [sys.executable, "-c", code, str(root), str(seed), str(gate), str(together)],
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        for seed in seeds
+    ]
+
+
+def _made(root):
+    files = [path for path in root.rglob("*") if path.is_file() and not path.name.startswith(".")]
+    return {path.relative_to(root).as_posix(): path.read_bytes() for path in files}
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_two_processes_make_one_stand_in(name, tmp_path):
+    """In an empty folder, at one moment: one makes it, the other waits; what a dead one left is completed."""
+    (tmp_path / "gate").mkdir()
+    together = _start(*MAKERS[name], tmp_path / "shared", tmp_path / "gate", [0, 0], 2)
+    assert [(process.communicate()[0], process.returncode) for process in together] == [("", 0)] * 2
+    (tmp_path / "own").mkdir()
+    killed = _start(*MAKERS[name], tmp_path / "alone", tmp_path / "own", [0], 1)[0]
+    while not any((tmp_path / "alone").glob("*standin-1/*")) and killed.poll() is None:
+        time.sleep(0.005)
+    killed.kill()
+    killed.wait()
+    (again,) = _start(*MAKERS[name], tmp_path / "alone", tmp_path / "own", [0], 1)
+    assert (again.communicate()[0], again.returncode) == ("", 0)
+    skipped = {"standin-1/standin-1.mp4"}  # a video's bytes hold the time
+    shared, alone = ({k: v for k, v in _made(tmp_path / f).items() if k not in skipped} for f in ("shared", "alone"))
+    assert shared.keys() == alone.keys()
+    assert [key for key in shared if shared[key] != alone[key]] == []
+
+
+def test_two_casts_in_one_folder(tmp_path):
+    """The quicker has it; the other is told, and has written nothing."""
+    (tmp_path / "gate").mkdir()
+    (tmp_path / "root").mkdir()
+    (tmp_path / "root" / ".DS_Store").touch()  # file browsers leave it in an empty folder
+    call, module = MAKERS["zju_mocap"]
+    ends = [
+        (p.communicate()[0], p.returncode)
+        for p in _start(call, module, tmp_path / "root", tmp_path / "gate", [0, 1], 2)
+    ]
+    assert sorted(status for _, status in ends) == [0, 2]
+    (words,) = [said for said, status in ends if status == 2]
+    assert "holds another stand-in (seed" in words
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_a_full_disk_leaves_what_can_be_completed(name, tmp_path):
+    call, module = MAKERS[name]
+    limit = (
+        "import resource, signal\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))\n"
+    )
+    calls = f"{call.replace('root', 'gate')}\n{limit}{call}"  # once without a limit: it compiles kernels
+    (tmp_path / "gate").mkdir()
+    code = PRELUDE.replace("(gate /", "(gate.parent /").format(module=module, call=calls.replace("\n", "\n    "))
+    words = [str(tmp_path / "root"), "0", str(tmp_path / "gate"), "0"]
+    full = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True)
+    assert full.returncode == 2, full.stderr
+    assert len(full.stdout.splitlines()) == 1
+    (tmp_path / "room").mkdir()
+    (room,) = _start(call, module, tmp_path / "root", tmp_path / "room", [0], 1)
+    assert (room.communicate()[0], room.returncode) == ("", 0)
