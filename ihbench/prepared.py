@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ihbench import atomic, registry
-from ihbench.data_source import DataSource, locate, standin_root
+from ihbench.data_source import DataSource, locate, own_data, standin_root
 from ihbench.errors import BadInput
 from ihbench.prepare import MANIFEST
 from ihbench.protocol import Protocol, protocol_from
@@ -32,9 +32,14 @@ class Prepared:
         for scene in scenes:
             if scene not in known:
                 raise BadInput(f"--scene {scene}: was not prepared: {registry.nearest(scene, list(known))}")
-        data = data or (self.data if self.data is not None and self.data.is_dir() else None)
         if data is None and self.data is None and next(iter(self.manifests.values()))["standin"]:
             return DataSource(self.protocol, standin_root(self.protocol.dataset), True, scenes or known)
+        if data is None and self.data is not None:
+            data = self.data if self.data.is_dir() else own_data(None)
+            if data is None:
+                raise BadInput(
+                    f"{self.data}: no such folder, but there lay the data that were prepared; name --data"
+                )
         return locate(self.protocol, data, scenes or known)
 
     def check(self, capture: Capture, body: Body) -> None:

@@ -152,6 +152,12 @@ def test_what_prepare_prints_scores_what_it_handed_out(bench, tmp_path, monkeypa
             path.parent.mkdir(parents=True, exist_ok=True)
             Image.fromarray(np.rint(view.image * 255).astype(np.uint8)).save(path)
             assert view.image.shape[:2] == (row["height"], row["width"])
+    if own:
+        file = out / "standin-1" / "manifest.json"
+        atomic.write_json(file, manifest | {"data": "../../gone"})
+        gone = bench(*words[1:])
+        assert (gone.status, "there lay the data that were prepared; name --data" in gone.err) == (2, True)
+        atomic.write_json(file, manifest)
     monkeypatch.chdir(tmp_path)
     words[words.index("DIR")] = "drawn"
     outcome = bench(*words[1:], "--runs", bench.runs, "--json")
