@@ -151,7 +151,7 @@ def _comparisons(
     found = [row for row in found if any(row["scores"].values())]
     if not found:
         return [], []
-    titles = [f"{metric_of(i).title} {Identity.parse(i).region}" for i in columns]
+    titles = [f"{metric_of(i).title} {Identity.parse(i).region} {metric_of(i).arrow}" for i in columns]
     lines = [
         "| component | scenes | " + " | ".join(titles) + " | fit s |",
         "|---|---:|" + "---:|" * (len(titles) + 1),

@@ -8,8 +8,8 @@ from typing import Any
 
 from ihbench.machine import BUSY
 from ihbench.reports.document import Words
-from ihbench.reports.labels import by_label
 from ihbench.results import RunResult
+from ihbench.row_labels import by_label
 
 UNSTABLE = 0.25  # repeats further apart than this share of their median are called unstable, as in `ihbench kernels`
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ihbench.calibration import DESCRIPTIONS, ROWS
+from ihbench.errors import BadInput
 from ihbench.metrics import Identity, Mean, macro_mean
 from ihbench.metrics.identity import metric_of
 from ihbench.quality_time import Target
@@ -25,11 +26,11 @@ from ihbench.reports.document import (
     strong,
 )
 from ihbench.reports.inpainting import inpainting_section
-from ihbench.reports.labels import by_label
 from ihbench.reports.ledger_table import ledger_section
 from ihbench.reports.run_time import across_sizes_section, run_time_section
 from ihbench.reports.significance import intervals_section
 from ihbench.results import RunResult
+from ihbench.row_labels import by_label
 
 Rows = dict[str, dict[str, Mean]]  # of one run: row -> identity -> mean
 
@@ -59,6 +60,37 @@ def general_report(
     if pictures:
         blocks += [Heading(2, "Figures"), *(Picture(file, caption) for file, caption in pictures)]
     return blocks
+
+
+def score_tables(results: Sequence[RunResult], presets: Sequence[str] = ()) -> list[tuple[str, Table]]:
+    """What a paper takes from a report: for each protocol, profile and kind of data one table of all metrics and
+    regions, and one for each further preset, with a title. Raises `BadInput` where no run is done."""
+    groups: dict[tuple[str, str, str, str], list[RunResult]] = {}
+    for result in results:
+        if result.status == "done":
+            groups.setdefault(result.group, []).append(result)
+    found: list[tuple[str, Table]] = []
+    for (protocol, digest, profile, data), runs in groups.items():
+        headline = runs[0].record["about"]["headline"]
+        title = f"{protocol} ({digest}), {profile} profile, {data.replace('*', '')}"
+        columns = [i for i in dict.fromkeys(i for r in runs for i in r.rows[r.method]) if _has_a_number(runs, i)]
+        if columns:
+            found.append((title, _table(runs, [run.rows for run in runs], columns, headline, with_metric=True)))
+        for preset in presets:
+            having = [run for run in runs if preset in run.presets]
+            rows = [run.presets[preset] for run in having]
+            columns = _preset_columns(rows)
+            if columns:
+                found.append((f"{title}, {preset}", _table(having, rows, columns, headline, with_metric=True)))
+    if not found:
+        raise BadInput("--fragment: no run that is done has a number here; there is no table to write")
+    return found
+
+
+def _preset_columns(rows: Sequence[Rows]) -> list[str]:
+    """Identities with a number in any row."""
+    every = dict.fromkeys(i for found in rows for means in found.values() for i in means)
+    return [i for i in every if any(i in means and not means[i].absent for found in rows for means in found.values())]
 
 
 def _group(runs: list[RunResult], presets: Sequence[str], targets: Sequence[Target]) -> list[Block]:
@@ -116,9 +148,7 @@ def _preset(name: str, runs: list[RunResult], headline: str) -> list[Block]:
         return [*blocks, Paragraph(f"No run was scored under {name}: ihbench report --preset {name}")]
     rows = [run.presets[name] for run in having]
     identities = list(dict.fromkeys(i for run, found in zip(having, rows, strict=True) for i in found[run.method]))
-    columns = [
-        i for i in identities if any(i in found[row] and not found[row][i].absent for found in rows for row in found)
-    ]
+    columns = _preset_columns(rows)
     if columns:
         blocks.append(_table(having, rows, columns, headline, with_metric=True))
     absent = {

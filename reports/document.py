@@ -17,7 +17,7 @@ class Span:
     """Some words in another style."""
 
     text: str
-    style: Literal["strong", "emphasis", "code"]
+    style: Literal["strong", "emphasis", "code", "raised"]  # raised: a footnote's letter
 
 
 Words = str | Span | tuple[str | Span, ...]

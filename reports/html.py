@@ -9,14 +9,15 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from ihbench.quality_time import Target
-from ihbench.reports.content import general_report
+from ihbench.reports.content import general_report, score_tables
 from ihbench.reports.document import Block, Bullets, Heading, Paragraph, Picture, Table, Words, spans
 from ihbench.reports.figures import draw
 from ihbench.reports.run_pictures import run_pictures
+from ihbench.reports.short_names import LONG, with_short_names
 from ihbench.results import RunResult
 from ihbench.visible_text import visible
 
-TAGS = {"strong": "strong", "emphasis": "em", "code": "code"}
+TAGS = {"strong": "strong", "emphasis": "em", "code": "code", "raised": "sup"}
 # even if something slipped through the escaping, a browser that obeys this neither runs it nor loads anything
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; form-action 'none'; base-uri 'none'"
 STYLE = """
@@ -43,14 +44,24 @@ def write(
     pictures: Sequence[tuple[Path, str]] = (),  # file, caption
     folder: Path = Path("."),  # where the text will lie; this report needs nothing beside it
     left_out: Sequence[str] = (),  # folders, with the reasons
+    fragment: bool = False,  # the tables of scores alone, without a document around them
 ) -> str:
     """The report of these runs; see `general_report`. The runs' own pictures are in it, and diagrams: the ones given,
     else its own."""
+    if fragment:
+        return fragments(results, presets)
     own = run_pictures(results)
     if pictures:
-        return page(general_report(results, presets, targets, [*pictures, *own], left_out))
+        return page(with_short_names(general_report(results, presets, targets, [*pictures, *own], left_out), LONG))
     with TemporaryDirectory() as name:
-        return page(general_report(results, presets, targets, [*draw(results, Path(name)), *own], left_out))
+        drawn = [*draw(results, Path(name)), *own]
+        return page(with_short_names(general_report(results, presets, targets, drawn, left_out), LONG))
+
+
+def fragments(results: Sequence[RunResult], presets: Sequence[str] = ()) -> str:
+    """The tables of scores alone, without a page around them."""
+    tables = with_short_names([table for _, table in score_tables(results, presets)], LONG)
+    return "\n".join(map(_block, tables)) + "\n"
 
 
 def page(blocks: Sequence[Block], title: str = "ihbench report") -> str:

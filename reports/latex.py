@@ -7,9 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ihbench.quality_time import Target
-from ihbench.reports.content import general_report
+from ihbench.reports.content import general_report, score_tables
 from ihbench.reports.document import Block, Bullets, Heading, Paragraph, Picture, Table, Words, spans
+from ihbench.reports.short_names import with_short_names
 from ihbench.results import RunResult
+from ihbench.visible_text import visible
 
 PREAMBLE = r"""\documentclass[10pt]{article}
 \usepackage[T1]{fontenc}
@@ -31,7 +33,8 @@ SPECIAL = {
     "²": r"\textsuperscript{2}", "³": r"\textsuperscript{3}", "µ": r"\textmu{}", "Δ": r"$\Delta$", "β": r"$\beta$",
     "†": r"\textdagger{}", "‡": r"\textdaggerdbl{}", "§": r"\S{}",
 }  # fmt: skip
-STYLES = {"strong": r"\textbf", "emphasis": r"\emph", "code": r"\texttt"}
+NEEDS = r"% a fragment for \input: needs \usepackage{booktabs}, \usepackage{textcomp} and, in pdflatex, T1 fonts"
+STYLES = {"strong": r"\textbf", "emphasis": r"\emph", "code": r"\texttt", "raised": r"\textsuperscript"}
 LATIN = 0x17F  # the last letter that T1 fonts have
 
 
@@ -43,9 +46,27 @@ def write(
     pictures: Sequence[tuple[Path, str]] = (),  # file, caption
     folder: Path = Path("."),  # where the text will lie
     left_out: Sequence[str] = (),  # folders, with the reasons
+    fragment: bool = False,  # the tables of scores alone, without a document around them
 ) -> str:
-    """The report of these runs; see `general_report`."""
-    return latex(general_report(results, presets, targets, pictures, left_out), folder)
+    """The report of these runs; see `general_report`. Row names are short, their switches stand below."""
+    if fragment:
+        return fragments(results, presets)
+    return latex(with_short_names(general_report(results, presets, targets, pictures, left_out)), folder)
+
+
+def fragments(results: Sequence[RunResult], presets: Sequence[str] = ()) -> str:
+    """The tabulars alone, to be taken into somebody's document with \\input; it needs booktabs. What belongs below a
+    table stands in comments."""
+    lines = [NEEDS]
+    for title, table in score_tables(results, presets):
+        lines.append(f"% {_comment(title)}")
+        for block in with_short_names([table]):
+            lines.append(_tabular(block) if isinstance(block, Table) else f"% below it: {_block(block, Path())}")
+    return "\n".join(lines) + "\n"
+
+
+def _comment(text: str) -> str:
+    return " ".join(visible(text).split())
 
 
 def latex(blocks: Sequence[Block], folder: Path = Path(".")) -> str:
@@ -84,10 +105,14 @@ def _block(block: Block, folder: Path) -> str:
 
 
 def _table(table: Table) -> str:
+    return rf"\fitted{{{_tabular(table)}}}"
+
+
+def _tabular(table: Table) -> str:
     columns = "l" * table.left + "r" * (len(table.head) - table.left)
     rows = [" & ".join(_words(cell) for cell in row) + r" \\" for row in (table.head, *table.rows)]
     body = "\n".join([r"\toprule", rows[0], r"\midrule", *rows[1:], r"\bottomrule"])
-    return rf"\fitted{{\begin{{tabular}}{{{columns}}}" + f"\n{body}\n" + r"\end{tabular}}"
+    return rf"\begin{{tabular}}{{{columns}}}" + f"\n{body}\n" + r"\end{tabular}"
 
 
 def _words(words: Words) -> str:

@@ -9,8 +9,9 @@ from pathlib import Path
 from urllib.parse import quote
 
 from ihbench.quality_time import Target
-from ihbench.reports.content import general_report
+from ihbench.reports.content import general_report, score_tables
 from ihbench.reports.document import Block, Bullets, Heading, Paragraph, Picture, Table, Words, spans
+from ihbench.reports.short_names import LONG, with_short_names
 from ihbench.results import RunResult
 from ihbench.visible_text import visible
 
@@ -25,9 +26,17 @@ def write(
     pictures: Sequence[tuple[Path, str]] = (),  # file, caption
     folder: Path = Path("."),  # where the text will lie
     left_out: Sequence[str] = (),  # folders, with the reasons
+    fragment: bool = False,  # the tables of scores alone, without a document around them
 ) -> str:
     """The report of these runs; see `general_report`."""
-    return markdown(general_report(results, presets, targets, pictures, left_out), folder)
+    if fragment:
+        return fragments(results, presets)
+    return markdown(with_short_names(general_report(results, presets, targets, pictures, left_out), LONG), folder)
+
+
+def fragments(results: Sequence[RunResult], presets: Sequence[str] = ()) -> str:
+    """The tables of scores alone."""
+    return markdown(with_short_names([table for _, table in score_tables(results, presets)], LONG))
 
 
 def markdown(blocks: Sequence[Block], folder: Path = Path(".")) -> str:
@@ -58,6 +67,8 @@ def _words(words: Words) -> str:
     return "".join(
         plain(piece)
         if isinstance(piece, str)
+        else f"<sup>{plain(piece.text)}</sup>"
+        if piece.style == "raised"
         else f"{MARKS[piece.style]}{_bare(piece.text) if piece.style == 'code' else plain(piece.text)}"
         f"{MARKS[piece.style]}"
         for piece in spans(words)

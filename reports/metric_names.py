@@ -37,6 +37,7 @@ ARROW = re.compile("[↑↓⬆⬇⇑⇓]")
 UPWARD = "↑⬆⇑"
 SCALE = re.compile(r"[×x*·]?\s*\b(1000|1e3|1e-3|10\s*-?3|100)\b|%", re.IGNORECASE)
 UNIT = re.compile(r"[(\[]\s*(dB|%|s|sec|ms|min|h|hours?|GB|GiB|MB|MiB|M|K|mm|cm|m)\s*[)\]]", re.IGNORECASE)
+THRESHOLD = re.compile(r"[≥≤<>]\s*=?\s*[\d.]")
 STAR = re.compile(r"\s*[*∗⋆]")
 
 
@@ -70,11 +71,12 @@ class HeadMetric:
 
 
 def head_metric(text: str) -> HeadMetric | None:
-    """The metric that a head names; None for a head with neither a known name nor an arrow."""
+    """The metric that a head names; None for a head with neither a known name nor an arrow, and for a threshold:
+    below "PSNR ≥ 25 dB" stand times, or whatever it took."""
     name, arrow = NAME.search(text), ARROW.search(text)
-    if name is None and arrow is None:
-        return None
     after = text[name.end() :] if name else ""
+    if arrow is None and (name is None or THRESHOLD.search(after)):
+        return None
     unit = UNIT.search(text)
     return HeadMetric(
         name=name[1].lower() if name else ARROW.sub("", text).strip().lower(),

@@ -8,18 +8,21 @@ own. Marks are computed inside a block.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from ihbench.calibration import DESCRIPTIONS, ROWS
 from ihbench.metrics import Identity, Mean, macro_mean
 from ihbench.metrics.statistics import Interval, mean_interval
-from ihbench.reports.labels import by_label
+from ihbench.protocol import REGIONS
 from ihbench.reports.marks import marks_by_interval, marks_by_value
 from ihbench.reports.paper_numbers import Column, Component, Group, PaperTable
+from ihbench.reports.short_names import Footnotes, split_label
 from ihbench.reports.significance import LEVEL, scene_means
 from ihbench.results import RunResult, group_row
+from ihbench.row_choice import EVERYTHING, Choice
+from ihbench.row_labels import by_label
 
 Kind = Literal["quoted", "real data", "stand-in"]
 MEASURED = {"real data": "measured", "stand-in": "stand-in"}  # a block's kind -> the status of its numbers
@@ -59,6 +62,12 @@ class Row:
     section: str = ""
     components: tuple[str, ...] = ()  # YES, NO or UNKNOWN
     calibration: bool = False  # bounds the methods, is not ranked
+    footnotes: tuple[str, ...] = ()  # letters: the switches that set it apart
+
+    @property
+    def name(self) -> str:
+        """The label without what stands in its footnotes."""
+        return split_label(self.label)[0] if self.footnotes else self.label
 
 
 @dataclass(frozen=True)
@@ -86,42 +95,39 @@ class Frame:
     notes: tuple[str, ...] = ()
 
 
-@dataclass
-class _Footnotes:
-    """Letters for texts, in the order in which they are first asked for."""
-
-    letters: dict[str, str] = field(default_factory=dict)
-
-    def letter(self, text: str) -> str:
-        return self.letters.setdefault(text, _letter(len(self.letters)))
-
-    def of(self, texts: Iterable[str]) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(self.letter(text) for text in texts))
-
-
-def _letter(k: int) -> str:
-    """a, b, …, z, aa, ab, …"""
-    return ("" if k < 26 else _letter(k // 26 - 1)) + chr(ord("a") + k % 26)
-
-
 def build_frame(
     table: PaperTable,
     results: Sequence[RunResult],
     region: str = "",
     as_printed: bool = False,
+    choice: Choice = EVERYTHING,
     left_out: Sequence[str] = (),
 ) -> Frame:
     """The table's frame, filled from the paper and from these runs.
 
     `results` under other protocols than the table's are left out. `region` is that of measured numbers; "" is every
-    protocol's headline. `as_printed` gives quoted rows the paper's own marks in place of computed ones. `left_out`
-    are run folders that could not be read, with the reasons.
+    protocol's headline; where `choice` has regions, measured blocks are there for each of them. `as_printed` gives
+    quoted rows the paper's own marks in place of computed ones. Marks are those among the chosen rows. `left_out` are
+    run folders that could not be read, with the reasons. Raises `BadInput` for a choice of what there is not.
     """
-    footnotes = _Footnotes()
-    blocks = [_quoted(table, footnotes, as_printed)]
-    blocks += _measured(table, results, region, footnotes)
+    footnotes = Footnotes()
+    names = _check(choice, table, results)
+    table = _columns_of(table, choice)
+    quoted = _quoted(table, footnotes, as_printed, choice)  # first: its letters are the same whatever is measured
+    measured = [
+        block
+        for shown in choice.regions or (region,)
+        for block in _measured(table, results, shown, bool(choice.regions), footnotes, choice)
+    ]
+    blocks = [quoted, *measured]
+    blocks = [
+        replace(block, rows=tuple(replace(r, label=names.get(r.label, r.label), footnotes=_apart(r, names, footnotes))
+                                  for r in block.rows))
+        for block in blocks
+        if block.rows or not choice.rows
+    ]  # fmt: skip
     notes = [*table.notes]
-    if len(blocks) == 1:
+    if not measured:
         protocols = dict.fromkeys(p for group in table.groups for p in group.protocols)
         notes.append(f"No measured rows: no finished run under {', '.join(protocols)} was found.")
     notes += [f"Left out: {line}." for line in left_out]
@@ -132,7 +138,41 @@ def build_frame(
 # ---------------------------------------------------------------------------------------------------- quoted rows
 
 
-def _quoted(table: PaperTable, footnotes: _Footnotes, as_printed: bool) -> Block:
+def _check(choice: Choice, table: PaperTable, results: Sequence[RunResult]) -> dict[str, str]:
+    """Label -> the new name of a row. Raises `BadInput` for words that name nothing here."""
+    labels = {row.name: row.name for row in table.rows}
+    for runs in _by_kind(table, results).values():
+        labels |= {label: having[0].method for label, having in by_label(_configured(runs)).items()}
+    having = [Identity.parse(i) for run in results for scores in run.rows.values() for i in scores]
+    choice.check(labels, [column.key for column in table.columns], [*REGIONS, *(i.region for i in having)])
+    return choice.renamed(labels)
+
+
+def _columns_of(table: PaperTable, choice: Choice) -> PaperTable:
+    """The table with the chosen metrics alone."""
+    if not choice.metrics:
+        return table
+    quoted = [column for group in table.groups if not group.measured_only for column in group.columns]
+    groups = [
+        replace(group, columns=tuple(column for column in group.columns if choice.has_metric(column.key)))
+        for group in table.groups
+    ]
+    rows = []
+    for row in table.rows:
+        cells = [c for c, column in zip(row.cells, quoted, strict=True) if choice.has_metric(column.key)]
+        rows.append(replace(row, cells=tuple(cells)))
+    return replace(table, groups=tuple(group for group in groups if group.columns), rows=tuple(rows))
+
+
+def _apart(row: Row, names: Mapping[str, str], footnotes: Footnotes) -> tuple[str, ...]:
+    """The letter of the switches that set a row apart, where somebody has not named it."""
+    switches = "" if row.label in names or row.calibration else split_label(row.label)[1]
+    return (footnotes.letter(switches),) if switches else ()
+
+
+def _quoted(table: PaperTable, footnotes: Footnotes, as_printed: bool, choice: Choice) -> Block:
+    wanted = choice.ordered({row.name: row.name for row in table.rows})
+    table = replace(table, rows=tuple(next(row for row in table.rows if row.name == name) for name in wanted))
     marks: list[list[str]]
     if as_printed:
         marks = [[row.printed if cell.status != "absent" else "" for cell in row.cells] for row in table.rows]
@@ -177,13 +217,31 @@ def _quoted(table: PaperTable, footnotes: _Footnotes, as_printed: bool) -> Block
 # -------------------------------------------------------------------------------------------------- measured rows
 
 
-def _measured(table: PaperTable, results: Sequence[RunResult], region: str, footnotes: _Footnotes) -> Iterator[Block]:
-    """One block for each combination of data, profile and protocol; real data first."""
+def _by_kind(table: PaperTable, results: Sequence[RunResult]) -> dict[tuple[str, str], list[RunResult]]:
+    """(stand-in, profile) -> runs under the table's protocols."""
     wanted = {protocol for group in table.groups for protocol in group.protocols}
     by_kind: dict[tuple[str, str], list[RunResult]] = {}
     for run in results:
         if _protocol(run) in wanted:
             by_kind.setdefault((run.record["about"]["standin"], run.identity["profile"]), []).append(run)
+    return by_kind
+
+
+def _configured(runs: Sequence[RunResult]) -> list[RunResult]:
+    """A run that failed early never said how it was configured: it is told of, but belongs to no row."""
+    return [run for run in runs if "changed" in run.record["about"]]
+
+
+def _measured(
+    table: PaperTable,
+    results: Sequence[RunResult],
+    region: str,
+    named: bool,  # whether the title names the region
+    footnotes: Footnotes,
+    choice: Choice,
+) -> Iterator[Block]:
+    """One block for each combination of data, profile and protocol; real data first."""
+    by_kind = _by_kind(table, results)
     for standin, profile in sorted(by_kind, key=lambda key: (bool(key[0]), *key)):
         runs = by_kind[standin, profile]
         # runs of one data set under several protocols, digests or variants go into several blocks
@@ -194,7 +252,8 @@ def _measured(table: PaperTable, results: Sequence[RunResult], region: str, foot
                 for group, having in zip(table.groups, keys, strict=True)
                 if k < len(having)
             ]
-            yield _measured_block(table, filled, standin, profile, region, footnotes)
+            block = _measured_block(table, filled, standin, profile, region, footnotes, choice)
+            yield replace(block, title=f"{block.title}, region {region}") if named else block
 
 
 def _protocol(run: RunResult) -> str:
@@ -213,11 +272,13 @@ def _measured_block(
     standin: str,
     profile: str,
     region: str,
-    footnotes: _Footnotes,
+    footnotes: Footnotes,
+    choice: Choice,
 ) -> Block:
     everything = list({id(run): run for _, runs in filled for run in runs}.values())
-    # a run that failed early never said how it was configured: it is told of, but belongs to no row
-    labelled = by_label([run for run in everything if "changed" in run.record["about"]])
+    labelled = by_label(_configured(everything))
+    wanted = choice.ordered({label: having[0].method for label, having in labelled.items()})
+    labelled = {label: labelled[label] for label in wanted}
     kind: Kind = "stand-in" if standin else "real data"
     notes: list[str] = []
     if standin:
@@ -228,7 +289,7 @@ def _measured_block(
     unlabelled = [run for run in everything if "changed" not in run.record["about"]]
     notes += [f"Not done: {run.method} on {_outcome(run)}." for run in unlabelled]
     columns: list[list[Cell]] = []  # by column, then by row
-    calibrations = [name for name in ROWS if any(name in run.rows for run in everything)]
+    calibrations = choice.bounds([name for name in ROWS if any(name in run.rows for run in everything)])
     for group, runs in filled:
         done = [run for run in runs if run.status == "done"]
         here = {id(run) for run in runs}
@@ -292,7 +353,7 @@ def _means(runs: Sequence[RunResult], identity: str, views: str) -> list[Mean]:
 
 
 def _cell(
-    column: Column, runs: Sequence[RunResult], views: str, identity: str, kind: Kind, footnotes: _Footnotes
+    column: Column, runs: Sequence[RunResult], views: str, identity: str, kind: Kind, footnotes: Footnotes
 ) -> tuple[Cell, dict[str, float]]:
     """A method's cell, and its finite means by scene."""
     done = [run for run in runs if run.status == "done"]
@@ -313,7 +374,7 @@ def _cell(
 
 
 def _bound(
-    column: Column, done: Sequence[RunResult], row: str, identity: str, kind: Kind, footnotes: _Footnotes
+    column: Column, done: Sequence[RunResult], row: str, identity: str, kind: Kind, footnotes: Footnotes
 ) -> Cell:
     """A calibration row's cell: the same for every run on a scene."""
     means = scene_means(done, identity, row)
@@ -323,7 +384,7 @@ def _bound(
     return replace(cell, text=cell.number, low=math.nan, high=math.nan)
 
 
-def _filled(column: Column, means: Mapping[str, Mean], identity: str, kind: Kind, footnotes: _Footnotes) -> Cell:
+def _filled(column: Column, means: Mapping[str, Mean], identity: str, kind: Kind, footnotes: Footnotes) -> Cell:
     total, scale = macro_mean(means), column.metric.scale
     if total.absent:
         return _absent(total.reason, footnotes)
@@ -338,7 +399,7 @@ def _filled(column: Column, means: Mapping[str, Mean], identity: str, kind: Kind
     return Cell(text, value, MEASURED[kind], low, high, max(len(finite), 1), identity=identity, footnotes=letters)
 
 
-def _absent(reason: str, footnotes: _Footnotes) -> Cell:
+def _absent(reason: str, footnotes: Footnotes) -> Cell:
     return Cell("—", math.nan, "absent", reason=reason, footnotes=footnotes.of([reason]))
 
 

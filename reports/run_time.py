@@ -352,7 +352,7 @@ def _end_table(configs: Sequence[Configuration], known: Sequence[str], headline:
         f"The last point of the curves, on {views} test views, and the same avatars over all test views, as in the "
         "table: mean over scenes of the mean over seeds. By so much the curves, the times and the areas are off."
     )
-    head = [f"{metric_of(i).title} {Identity.parse(i).region}" for i in columns]
+    head = [f"{metric_of(i).title} {Identity.parse(i).region} {metric_of(i).arrow}" for i in columns]
     return [
         Heading(3, "Where the curves end, and what the table has"),
         Table(("method", *head), tuple(rows)),
@@ -393,7 +393,7 @@ def _area_table(configs: Sequence[Configuration], known: Sequence[str]) -> list[
     for c in configs:
         cells = [_area_cell(curves(c, i), i, start, end, scenes) for i, start, end in columns]
         rows.append((c.label, *cells))
-    head = [f"{metric_of(i).title} {Identity.parse(i).region}" for i, _, _ in columns]
+    head = [f"{metric_of(i).title} {Identity.parse(i).region} {metric_of(i).arrow}" for i, _, _ in columns]
     windows = sorted({f"{_seconds(start)} to {_seconds(end)}" for _, start, end in columns})
     told = (
         f"Mean of the metric over the logarithm of fitting time, from {'; '.join(windows)}: from the latest first "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -13,6 +14,8 @@ from ihbench.errors import BadInput
 
 if TYPE_CHECKING:
     from ihbench.results import RunResult
+
+FORMATS = {"md": "markdown", "tex": "latex", "html": "html"}  # -> module of the writer
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,17 @@ class TableOptions:
     """Region of measured numbers, such as full; by default every protocol's headline region."""
     format: Literal["md", "tex", "html", "csv", "json"] = "md"
     """How it is written."""
+    regions: tuple[str, ...] = ()
+    """Several regions of measured numbers, a block for each."""
+    rows: tuple[str, ...] = ()
+    """Only these rows, in this order: names as in the tables, bounds such as truth, or a method, which stands for all
+    of its rows unless one has just that name."""
+    metrics: tuple[str, ...] = ()
+    """Only these metrics, as psnr or lpips."""
+    names: tuple[str, ...] = ()
+    """Other names for rows, OLD=NEW."""
+    fragment: bool = False
+    """Only the table, without a document around it; in LaTeX the tabular alone, for \\input."""
     as_printed: bool = False
     """Give quoted rows the paper's own marks, wrong ones included, in place of computed ones."""
     out: Path | None = None
@@ -44,12 +58,16 @@ class TableCommand:
         chosen = options(TableOptions, argv, f"report {self.name}", self.summary)
         from ihbench.reports.paper_numbers import paper_table
         from ihbench.reports.paper_table import build_frame
+        from ihbench.row_choice import Choice
 
+        if chosen.region and chosen.regions:
+            raise BadInput("--region and --regions: give one of them")
         outputs.check_file(chosen.out)
         table = paper_table(self.name)
         results, left_out = _results(chosen, [p for group in table.groups for p in group.protocols])
-        frame = build_frame(table, results, chosen.region, chosen.as_printed, left_out)
-        text = _writer(chosen.format)(frame)
+        choice = Choice(chosen.rows, chosen.metrics, chosen.regions, chosen.names)
+        frame = build_frame(table, results, chosen.region, chosen.as_printed, choice, left_out)
+        text = _writer(chosen.format, chosen.fragment)(frame)
         if chosen.out is None:
             print(text, end="")
         else:
@@ -57,19 +75,16 @@ class TableCommand:
         return 0
 
 
-def _writer(name: str) -> Callable[..., str]:
+def _writer(name: str, fragment: bool) -> Callable[..., str]:
     """Imported when asked for: a page or a document brings more than a CSV file needs."""
-    if name == "md":
-        from ihbench.reports.table_markdown import write
-    elif name == "tex":
-        from ihbench.reports.table_latex import write
-    elif name == "html":
-        from ihbench.reports.table_html import write
-    elif name == "csv":
-        from ihbench.reports.table_data import write_csv as write
-    else:
-        from ihbench.reports.table_data import write_json as write
-    return write
+    if name in ("csv", "json"):
+        from ihbench.reports.table_data import write_csv, write_json
+
+        if fragment:
+            raise BadInput(f"--fragment: {name} has no document around it; leave it out, or take tex, md or html")
+        return write_csv if name == "csv" else write_json
+    module = import_module(f"ihbench.reports.table_{FORMATS[name]}")
+    return module.fragment if fragment else module.write
 
 
 def _results(chosen: TableOptions, protocols: list[str]) -> tuple[list[RunResult], list[str]]:

@@ -36,7 +36,22 @@ def write(frame: Frame) -> str:
     )
 
 
+def fragment(frame: Frame) -> str:
+    """The tables alone, one for each block, without a page around them."""
+    return "\n".join(_table(frame, block) for block in frame.blocks) + "\n"
+
+
 def _block(frame: Frame, block: Block) -> str:
+    return "\n".join(
+        [
+            f'<section class="{block.kind.replace(" ", "-")}"><h2>{escape(block.title)}</h2>',
+            f'<div class="wide">{_table(frame, block)}</div>',
+            "<ul>" + "".join(f"<li>{escape(note)}</li>" for note in block.notes) + "</ul></section>",
+        ]
+    )
+
+
+def _table(frame: Frame, block: Block) -> str:
     words = [frame.head, "status", *block.components]
     above = "".join(f'<th class="group" colspan="{len(g.columns)}">{escape(g.name)}</th>' for g in block.groups)
     below = "".join(f'<th class="left">{escape(word)}</th>' for word in words)
@@ -47,20 +62,19 @@ def _block(frame: Frame, block: Block) -> str:
         section = row.section
     return "\n".join(
         [
-            f'<section class="{block.kind.replace(" ", "-")}"><h2>{escape(block.title)}</h2>',
-            '<div class="wide"><table><thead>',
+            "<table><thead>",
             f'<tr><th colspan="{len(words)}"></th>{above}</tr><tr>{below}</tr></thead>',
             "<tbody>",
             *rows,
-            "</tbody></table></div>",
-            "<ul>" + "".join(f"<li>{escape(note)}</li>" for note in block.notes) + "</ul></section>",
+            "</tbody></table>",
         ]
     )
 
 
 def _row(row: Row, begins: bool) -> str:
     kinds = [name for name, holds in (("section", begins), ("calibration", row.calibration)) if holds]
-    label = f"<em>{escape(row.label)}</em>" if row.calibration else escape(row.label)
+    label = f"<em>{escape(row.name)}</em>" if row.calibration else escape(row.name)
+    label += f"<sup>{', '.join(row.footnotes)}</sup>" if row.footnotes else ""
     cells = "".join(f'<td class="left">{word}</td>' for word in (label, escape(row.status), *row.components))
     opening = f'<tr class="{" ".join(kinds)}">' if kinds else "<tr>"
     return opening + cells + "".join(_cell(cell) for cell in row.cells) + "</tr>"

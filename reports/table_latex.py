@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
-from ihbench.reports.latex import PREAMBLE, escape
+from ihbench.reports.latex import NEEDS, PREAMBLE, escape
 from ihbench.reports.paper_table import Block, Cell, Frame, Row
+from ihbench.visible_text import visible
 
 MARKS = {"best": r"\textbf{%s}", "second": r"\underline{%s}", "": "%s"}
 PAIRED = "% ihbench lint: paired"  # tells the linter that marks come from paired differences
 CHECK = {"✓": r"$\surd$", "": "", "?": "?"}
+
+
+def fragment(frame: Frame) -> str:
+    """The tabulars alone, one for each block, to be taken into somebody's document with \\input. What belongs below
+    stands in comments."""
+    lines = [NEEDS]
+    for block in frame.blocks:
+        lines += [f"% {' '.join(visible(block.title).split())}", *([PAIRED] if block.kind != "quoted" else [])]
+        lines.append(_tabular(frame, block))
+    lines += [rf"% \textsuperscript{{{letter}}} {escape(text)}" for letter, text in frame.footnotes.items()]
+    return "\n".join(lines) + "\n"
 
 
 def write(frame: Frame) -> str:
@@ -19,6 +31,20 @@ def write(frame: Frame) -> str:
 
 
 def _block(frame: Frame, block: Block, k: int) -> str:
+    lines = [
+        *([PAIRED] if block.kind != "quoted" else []),
+        r"\begin{table}[!htbp]",
+        r"\centering\footnotesize",
+        rf"\caption{{{escape(f'{frame.title}. {block.title}')}.}}",
+        rf"\label{{tab:{frame.name}-{k + 1}}}",
+        rf"\par\smallskip\fitted{{{_tabular(frame, block)}}}",
+        _notes([escape(note) for note in block.notes]),
+        r"\end{table}",
+    ]
+    return "\n".join(lines)
+
+
+def _tabular(frame: Frame, block: Block) -> str:
     left = 2 + len(block.components)
     spec = "ll" + "c" * len(block.components) + "r" * len(block.columns)
     groups, rules, at = [], [], left + 1
@@ -29,12 +55,7 @@ def _block(frame: Frame, block: Block, k: int) -> str:
         at += width
     head = [frame.head, "status", *block.components, *(column.title for column in block.columns)]
     lines = [
-        *([PAIRED] if block.kind != "quoted" else []),
-        r"\begin{table}[!htbp]",
-        r"\centering\footnotesize",
-        rf"\caption{{{escape(f'{frame.title}. {block.title}')}.}}",
-        rf"\label{{tab:{frame.name}-{k + 1}}}",
-        rf"\par\smallskip\fitted{{\begin{{tabular}}{{{spec}}}",
+        rf"\begin{{tabular}}{{{spec}}}",
         r"\toprule",
         " & " * left + " & ".join(groups) + r" \\",
         " ".join(rules),
@@ -47,12 +68,13 @@ def _block(frame: Frame, block: Block, k: int) -> str:
             lines.append(r"\midrule")
             section = row.section
         lines.append(_row(row))
-    lines += [r"\bottomrule", r"\end{tabular}}", _notes([escape(note) for note in block.notes]), r"\end{table}"]
+    lines += [r"\bottomrule", r"\end{tabular}"]
     return "\n".join(lines)
 
 
 def _row(row: Row) -> str:
-    label = rf"\emph{{{escape(row.label)}}}" if row.calibration else escape(row.label)
+    label = rf"\emph{{{escape(row.name)}}}" if row.calibration else escape(row.name)
+    label += rf"\textsuperscript{{{', '.join(row.footnotes)}}}" if row.footnotes else ""
     cells = [label, escape(row.status), *(CHECK[part] for part in row.components), *map(_cell, row.cells)]
     # after the \\ of the row above, a bracket or a star would be taken for its argument
     return ("{}" if label[:1] in "[*" else "") + " & ".join(cells) + r" \\"

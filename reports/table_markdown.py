@@ -21,18 +21,27 @@ def write(frame: Frame) -> str:
     return "\n".join(lines).rstrip() + "\n"
 
 
+def fragment(frame: Frame) -> str:
+    """The tables alone, one for each block."""
+    return "\n\n".join("\n".join(_table(frame, block)) for block in frame.blocks) + "\n"
+
+
 def _block(frame: Frame, block: Block) -> list[str]:
-    columns = [f"{column.group} {column.title}" for column in block.columns]
-    head = [frame.head, "status", *block.components, *columns]
-    rule = "---|" * 2 + ":---:|" * len(block.components) + "---:|" * len(columns)
-    lines = [f"### {plain(block.title)}", "", *([PAIRED] if block.kind != "quoted" else [])]
-    lines += [_line([plain(word) for word in head]), f"|{rule}"]
-    lines += [_line(_row(row)) for row in block.rows]
+    lines = [f"### {plain(block.title)}", "", *_table(frame, block)]
     return [*lines, "", *(f"- {plain(note)}" for note in block.notes)]
 
 
+def _table(frame: Frame, block: Block) -> list[str]:
+    columns = [f"{column.group} {column.title}" for column in block.columns]
+    head = [frame.head, "status", *block.components, *columns]
+    rule = "---|" * 2 + ":---:|" * len(block.components) + "---:|" * len(columns)
+    lines = [*([PAIRED] if block.kind != "quoted" else []), _line([plain(word) for word in head]), f"|{rule}"]
+    return [*lines, *(_line(_row(row)) for row in block.rows)]
+
+
 def _row(row: Row) -> list[str]:
-    label = f"*{plain(row.label)}*" if row.calibration else plain(row.label)
+    label = f"*{plain(row.name)}*" if row.calibration else plain(row.name)
+    label += f"<sup>{', '.join(row.footnotes)}</sup>" if row.footnotes else ""
     return [label, row.status, *row.components, *(_cell(row, cell) for cell in row.cells)]
 
 

@@ -114,7 +114,8 @@ class ReadRow:
     def ranked(self) -> bool:
         from ihbench.calibration import ROWS
 
-        return self.label not in ROWS and UNRANKED.match(self.label) is None
+        first = self.label.partition(" / ")[0]  # what follows tells rows of one name apart
+        return first not in ROWS and UNRANKED.match(self.label) is None
 
 
 @dataclass(frozen=True)

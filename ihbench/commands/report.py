@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -48,6 +49,17 @@ class ReportOptions:
     """Folder for diagrams of error against run time: PNG, SVG, and their numbers as CSV."""
     target: tuple[str, ...] = ()
     """Qualities whose time is asked for, as psnr=25, flip=0.15 or psnr/hidden=20; without them round ones."""
+    rows: tuple[str, ...] = ()
+    """Only these rows, in this order: names as in the tables, bounds such as truth, or a method, which stands for all
+    of its rows unless one has just that name."""
+    metrics: tuple[str, ...] = ()
+    """Only these metrics, as psnr or flip."""
+    regions: tuple[str, ...] = ()
+    """Only these regions, as body or hidden."""
+    names: tuple[str, ...] = ()
+    """Other names for rows, OLD=NEW."""
+    fragment: bool = False
+    """Only the tables of scores, without a document around them; in LaTeX the tabular alone, for \\input."""
     out: Path | None = None
     """File to write; without it the report goes to stdout."""
 
@@ -61,9 +73,13 @@ def main(argv: list[str]) -> int:
     from ihbench.metrics.evaluate import find_preset
     from ihbench.quality_time import Target
     from ihbench.results import read_results
+    from ihbench.row_choice import Choice
 
     outputs.check_file(chosen.out)
     write = registry.load("report", chosen.format)
+    only = {"fragment": True} if chosen.fragment else {}
+    if only and "fragment" not in signature(write).parameters:
+        raise BadInput(f"--fragment: the report {chosen.format!r} has no fragments; leave it out, or --format tex")
     targets = [Target.parse(text) for text in chosen.target]
     for name in chosen.preset:
         find_preset(name)
@@ -76,12 +92,13 @@ def main(argv: list[str]) -> int:
         )
     if chosen.preset:
         results = [_with_presets(result, chosen) for result in results]
+    results = Choice(chosen.rows, chosen.metrics, chosen.regions, chosen.names).applied(results)
     pictures: list[tuple[Path, str]] = []
     if chosen.figures is not None:
         for name in registry.names("figure"):
             pictures += registry.load("figure", name)(results, chosen.figures)
     folder = Path(".") if chosen.out is None else chosen.out.parent
-    text = write(results, chosen.preset, targets=targets, pictures=pictures, folder=folder, left_out=left_out)
+    text = write(results, chosen.preset, targets=targets, pictures=pictures, folder=folder, left_out=left_out, **only)
     if chosen.out is None:
         print(text, end="")
     else:

@@ -30,9 +30,7 @@ def ihbench(tmp_path, monkeypatch):
 
 def test_the_verbs_are_registered_and_can_be_found(ihbench):
     assert registry.names("report verb") == ["lint", "table1", "table2"]
-    with pytest.raises(SystemExit) as end:
-        ihbench("report", "lint", "--help")
-    assert not end.value.code
+    assert ihbench("report", "lint", "--help").status == 0
 
 
 def test_a_table_is_there_without_any_run(ihbench):
@@ -95,7 +93,7 @@ def test_what_the_linter_does_not_understand_goes_to_stderr(ihbench, tmp_path):
     ("words", "told"),
     [
         (["lint"], "which file?"),
-        (["lint", "nowhere.tex"], "nowhere.tex: cannot be read"),
+        (["lint", "nowhere.tex"], "nowhere.tex: cannot be opened"),
         (["lint", "empty.md"], "empty.md: no table in it"),
         (["lint", "table.pdf"], "table.pdf: expected a .tex or .md file"),
         (["table1", "--runs", "nowhere"], "--runs nowhere: no such folder"),
@@ -121,3 +119,39 @@ def test_a_damaged_run_is_named_and_left_out(ihbench, tmp_path):
     assert outcome.status == 0
     assert "left out" in outcome.err
     assert "| mine | stand-in | 22.00 |" in outcome.out
+
+
+@pytest.mark.parametrize("format", ["md", "tex", "html"])
+def test_what_is_written_is_chosen_on_the_command_line(ihbench, tmp_path, format):
+    for scene in "abc":
+        write_run(tmp_path / "runs", scene, "mine", 20.0, 0.9)
+        write_run(tmp_path / "runs", scene, "other", 19.0, 0.8)
+    choice = ("--rows", "other", "mine", "--metrics", "psnr", "--regions", "body", "--names", "mine=Our own")
+    for words in (("report",), ("report", "table1")):
+        outcome = ihbench(*words, *choice, "--fragment", "--format", format)
+        assert outcome.status == 0, outcome.err
+        assert outcome.out.index("other") < outcome.out.index("Our own")
+        assert "SSIM" not in outcome.out
+        assert not any(word in outcome.out for word in ("documentclass", "<html", "# ", "HumanNeRF", "truth"))
+        if format != "html":
+            (tmp_path / f"own.{format}").write_text(outcome.out)
+            assert ihbench("report", "lint", f"own.{format}").status == 0
+        for bad, near in (
+            (("--rows", "mien"), "did you mean 'mine'"),
+            (("--metrics", "pnsr"), "did you mean 'psnr'"),
+        ):
+            refused = ihbench(*words, *bad, "--format", format)
+            assert (refused.status, refused.err.count("\n")) == (2, 1)
+            assert near in refused.err
+
+
+def test_what_has_no_document_around_it_has_no_fragment(ihbench, tmp_path):
+    outcome = ihbench("report", "table1", "--format", "csv", "--fragment")
+    assert outcome.status == 2
+    assert "--fragment: csv" in outcome.err
+    assert ihbench("report", "table1", "--region", "body", "--regions", "hidden").status == 2
+    write_run(tmp_path / "runs", "a", "mine", 20.0, 0.9)
+    assert (
+        "no run that is done has a number"
+        in ihbench("report", "--regions", "body", "--metrics", "lpips", "--fragment").err
+    )

@@ -155,7 +155,7 @@ def test_a_time_to_a_quality_that_the_table_lacks_says_on_which_views_it_was_rea
 def test_where_the_curve_ends_is_said_beside_the_table(tmp_path):
     title = "Where the curves end, and what the table has"
     found = cells(section([made_up(tmp_path, psnr=17.8)]), "ours", title)
-    assert found["PSNR body"] == "23.00, in the table 17.80 (+5.20)"
+    assert found["PSNR body ↑"] == "23.00, in the table 17.80 (+5.20)"
     assert title not in section([made_up(tmp_path, psnr=23.0)])
     assert "on all 4 test views" in section([made_up(tmp_path, views=4)])
     assert "on 3 of 55 or all 4 test views" in section(
@@ -185,8 +185,10 @@ def test_the_area_is_over_one_window_for_all_rows(tmp_path):
     level.append(made_up(tmp_path, "a", "theirs", curve=((4.0, 10.0), (16.0, 20.0))))
     text = section(level)
     title = "Area under the quality-time curve"
-    assert cells(text, "ours", title)["PSNR body"] == "20.00"
-    assert cells(text, "theirs", title)["PSNR body"] == "16.67"  # from 4 s to 32 s: 10 → 20 over two octaves, then 20
+    assert cells(text, "ours", title)["PSNR body ↑"] == "20.00"
+    assert (
+        cells(text, "theirs", title)["PSNR body ↑"] == "16.67"
+    )  # from 4 s to 32 s: 10 → 20 over two octaves, then 20
     assert "from 4 s to 32 s" in text
 
 

@@ -9,13 +9,18 @@ from ihbench.results import RunResult
 
 def by_label(runs: Sequence[RunResult]) -> dict[str, list[RunResult]]:
     """Runs by their row's label, in the order given. Seeds and scenes of one configuration share a row."""
+    return {_with_views(label, row): row for label, row in by_configuration(runs).items()}
+
+
+def by_configuration(runs: Sequence[RunResult]) -> dict[str, list[RunResult]]:
+    """Runs by the label alone, without what is told beside it: that views are missing."""
     codes: dict[str, set[str]] = {}
     for run in runs:
         codes.setdefault(run.method, set()).add(run.identity["code"])
     found: dict[str, list[RunResult]] = {}
     for run in runs:
         found.setdefault(_label(run, several_codes=len(codes[run.method]) > 1), []).append(run)
-    return {_with_views(label, row): row for label, row in found.items()}
+    return found
 
 
 def _with_views(label: str, runs: Sequence[RunResult]) -> str:
@@ -25,11 +30,14 @@ def _with_views(label: str, runs: Sequence[RunResult]) -> str:
         return label
     views = sum(run.record["about"].get("predictions", {}).get("views", 0) for run in runs)
     told = f"only {views - missing} of {views} views" if views else f"{missing} views missing"
-    return f"{label.removesuffix(')')}, {told})"
+    return f"{label[:-1]}, {told})" if label.endswith(")") else f"{label} ({told})"
 
 
 def _label(run: RunResult, several_codes: bool) -> str:
-    """The method with what sets this row apart. Runs of several versions of its code are several rows."""
+    """The method with what sets this row apart, or the name that somebody gave the row. Runs of several versions of
+    its code are several rows."""
+    if "label" in run.record["about"]:
+        return run.record["about"]["label"]
     changed = list(run.record["about"]["changed"])
     if run.record["about"].get("provenance") == "predictions":
         changed.append("predictions")
