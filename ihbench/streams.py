@@ -33,8 +33,13 @@ class Stdout(io.TextIOWrapper):
     failure: OSError | None = None
 
     def __init__(self, plain: io.TextIOWrapper):
-        options = {"line_buffering": plain.line_buffering, "write_through": plain.write_through}
-        super().__init__(plain.buffer, plain.encoding, plain.errors, **options)
+        super().__init__(
+            plain.buffer,
+            plain.encoding,
+            plain.errors,
+            line_buffering=plain.line_buffering,
+            write_through=plain.write_through,
+        )
         self.plain = plain  # would close what both write to when nobody held it
 
     def write(self, text: str, /) -> int:

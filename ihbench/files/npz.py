@@ -6,6 +6,7 @@ import math
 import zipfile
 from collections.abc import Collection
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,7 +50,7 @@ def read_npz(path: str | Path, names: Collection[str] | None = None, largest: in
     return arrays
 
 
-def _array(member: zipfile.ZipExtFile, where: str, largest: int) -> NDArray:
+def _array(member: IO[bytes], where: str, largest: int) -> NDArray:
     shape, fortran, dtype = read_npy_header(member, where)
     if dtype.kind not in PLAIN:
         raise BadInput(f"{where}: expected numbers or text, found {dtype}; write the file again with plain arrays")

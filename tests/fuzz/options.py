@@ -105,8 +105,8 @@ def _kinds(command: tuple[str, ...], kind: Any) -> Iterator[tuple[tuple[str, ...
         yield command, kind
         return
     for part in get_args(kind):
-        about = part.__metadata__[0] if hasattr(part, "__metadata__") else None
-        yield (*command, about.name), get_args(part)[0] if about else part
+        dataclass_, about = get_args(part)[0], part.__metadata__[0]
+        yield (*command, about.name), dataclass_
 
 
 def _flags(kind: type, prefix: str) -> Iterator[str]:
