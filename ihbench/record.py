@@ -94,6 +94,8 @@ class PredictionFiles(TypedDict):
     missing: list[str]
     surplus: list[str]
     notes: list[str]
+    doubts: NotRequired[list[str]]
+    alpha: NotRequired[str]
     views: NotRequired[Count]
 
 

@@ -173,7 +173,10 @@ def make_run(
     told = about(
         changed=list(changed), left_out=left_out, device="cpu", hidden_share=0.5, measure={"pixel_mm": 4.0},
         body="procedural",
-        predictions={"folder": "x", "pattern": "*", "missing": [], "surplus": [], "notes": ["odd"]},
+        predictions={
+            **{"folder": "x", "pattern": "*", "missing": [], "surplus": [], "notes": ["odd"]},
+            **{"doubts": ["BGR"], "alpha": "straight", "views": 4},
+        },
     )  # fmt: skip
     told["protocol"] |= {"id": "zju_occ", "image": {"size": 64, "background": [1.0, 1.0, 1.0]}}
     config = {"levels": [16, 64], "grid": {"on": True}, "rate": 1e-3, "keep": ["steps"], "set": list(changed)}
