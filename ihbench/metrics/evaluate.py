@@ -222,8 +222,10 @@ def _color_image(image: Any, name: str, hdr: bool) -> NDArray:
 
 def _checked_region(region: Any, shape: tuple[int, ...]) -> Region:
     """The region as a mask with both states, None for a mask of everything, a reason for one of nothing."""
-    if region is None or isinstance(region, str):
+    if isinstance(region, str):
         return region
+    if region is None:
+        return None if shape[0] * shape[1] else "an image without a pixel"
     mask = as_mask(region, shape)
     covered = int(np.count_nonzero(mask))
     return "empty region in this view" if covered == 0 else None if covered == mask.size else mask

@@ -132,10 +132,10 @@ def check_images(pred: NDArray, truth: NDArray, *, mixed: bool = False) -> None:
     """Raise `ValueError`, naming both sides, unless two images can be compared; `mixed`: one may be uint8."""
     if pred.shape != truth.shape:
         word = ""
-        if pred.shape[:2] == truth.shape[1::-1]:
-            word = "; rows and columns of one are exchanged: transpose it"
-        elif pred.shape[:2] == truth.shape[:2]:
+        if pred.shape[:2] == truth.shape[:2]:
             word = "; repeat the grey one's channel, or drop it from both"
+        elif pred.shape[:2] == truth.shape[1::-1]:
+            word = "; rows and columns of one are exchanged: transpose it"
         raise ValueError(
             f"images: expected two of the same shape [H, W] or [H, W, C], got pred {pred.shape}, "
             f"truth {truth.shape}{word}"

@@ -177,8 +177,9 @@ def _cloud(count: int, seed: int = 0) -> tuple[NDArray, NDArray, NDArray]:
 
 
 def _negative_scale() -> Answer:
+    """Squared they would be drawn; but they are logarithms, which make another picture."""
     means, scales, colors = _cloud(40)
-    return Answer(np.stack(draw(means, -scales, colors)), np.stack(draw(means, scales, colors)))
+    return Answer(words_of(ValueError, lambda: draw(means, np.log(scales), colors)), "go through exp()")
 
 
 def _size(width: int, height: int) -> Answer:
@@ -333,7 +334,8 @@ CASES = [
     ),
     _splat("splat-bad-gradient", "gradients beside a centre of NaN", "absolute", 1e-12,
            "float64 in the twin, the same float32 sums in the fast one", _bad_gradient),
-    _splat("splat-negative-scale", "a scale enters squared", "absolute", 0, EXACT, _negative_scale),
+    Case("splat-negative-scale", "splat", "logarithms of scales", "words", 0, "they must be refused", _negative_scale,
+         version=2),
     *(
         _splat(f"splat-{w}x{h}", f"an image of {w}×{h} px", "absolute", 1e-5, FLOAT32, partial(_size, w, h))
         for w, h in ((1, 1), (17, 33))

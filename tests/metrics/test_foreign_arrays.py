@@ -197,3 +197,14 @@ def test_the_training_loss_refuses_what_the_metric_does(change, word):
     ssim_map_torch(-0.2 + 1.4 * x, y)  # a prediction in training may leave the range
     with pytest.raises(ValueError, match=word):
         ssim_map_torch(change(x), change(y))
+
+
+def test_two_shapes_say_how_they_differ_and_an_empty_image_says_so():
+    for pred, word in ((A[..., 0], "grey"), (A.transpose(1, 0, 2), "transpose"), (A[:5], "same shape")):
+        with pytest.raises(ValueError, match=word):
+            psnr(pred, B)
+    with pytest.raises(ValueError, match="grey"):
+        psnr(A[:20, :, 0], B[:20, :, :1])  # a square: nothing is exchanged
+    assert {score.reason for name, score in evaluate(A[:0], B[:0]).items() if "lpips" not in name} == {
+        "an image without a pixel"
+    }
