@@ -486,10 +486,10 @@ def test_metadata_that_is_not_json_of_frames(sequence, text):
 
 def test_metadata_missing_or_not_utf8(sequence):
     (sequence / "metadata.json").write_bytes(b'{"\xff": 1}')
-    with pytest.raises(BadInput, match=r"metadata.json: not valid JSON in UTF-8"):
+    with pytest.raises(BadInput, match=r"metadata.json: not UTF-8 text"):
         opened(sequence)
     (sequence / "metadata.json").unlink()
-    with pytest.raises(BadInput, match=r"metadata.json: cannot be read \(No such file"):
+    with pytest.raises(BadInput, match=r"metadata.json: cannot be opened \(No such file"):
         opened(sequence)
 
 
