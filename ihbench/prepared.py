@@ -37,9 +37,7 @@ class Prepared:
         if data is None and self.data is not None:
             data = self.data if self.data.is_dir() else own_data(None)
             if data is None:
-                raise BadInput(
-                    f"{self.data}: no such folder, but there lay the data that were prepared; name --data"
-                )
+                raise BadInput(f"{self.data}: no such folder, but there lay the data that were prepared; name --data")
         return locate(self.protocol, data, scenes or known)
 
     def check(self, capture: Capture, body: Body) -> None:

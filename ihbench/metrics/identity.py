@@ -31,7 +31,9 @@ class Metric:
         """A value as a table shows it: "—" when absent, "∞" without any error."""
         if math.isnan(value):
             return "—"
-        return "∞" if math.isinf(value) else f"{value * self.scale:.{self.decimals}f}"
+        if math.isinf(value):
+            return "∞" if value > 0 else "−∞"
+        return f"{value * self.scale:.{self.decimals}f}"
 
 
 METRICS = {

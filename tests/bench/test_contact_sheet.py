@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from ihbench.contact_sheet import COLUMNS, GREY, SheetRow, contact_sheet, error_image, write_png
@@ -114,3 +115,20 @@ def test_a_png_comes_back_as_it_was(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(BadInput):
         write_png(tmp_path / "file" / "sheet.png", image)
+
+
+def test_8_bit_pictures_and_tensors_do_not_wrap_around_and_other_layouts_are_refused():
+    rng = np.random.default_rng(0)
+    truth, prediction = rng.integers(0, 256, (2, 4, 5, 3)).astype(np.uint8)
+    expected = error_image((prediction / 255).astype(np.float32), (truth / 255).astype(np.float32))
+    assert np.abs(error_image(prediction, truth).astype(int) - expected).max() <= 1
+    row = SheetRow("a", truth, truth, torch.tensor(prediction / 255))
+    np.testing.assert_allclose(row.truth, truth / 255, atol=1e-7)
+    np.testing.assert_allclose(row.prediction, prediction / 255, atol=1e-7)
+    for wrong in (prediction.transpose(2, 0, 1), prediction[None], prediction.astype(np.int64), prediction[:2]):
+        with pytest.raises(ValueError, match="expected"):
+            SheetRow("a", truth, truth, wrong)
+        with pytest.raises(ValueError, match="expected"):
+            error_image(wrong, truth)
+    with pytest.raises(ValueError, match="training"):
+        SheetRow("a", truth / 255, truth, prediction)
