@@ -116,7 +116,7 @@ def build_frame(
     quoted = _quoted(table, footnotes, as_printed, choice)  # first: its letters are the same whatever is measured
     measured = [
         block
-        for shown in choice.regions or (region,)
+        for shown in dict.fromkeys(choice.regions or (region,))
         for block in _measured(table, results, shown, bool(choice.regions), footnotes, choice)
     ]
     blocks = [quoted, *measured]

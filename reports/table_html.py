@@ -18,7 +18,6 @@ tr.calibration { color: #666; } td.absent { color: #888; } td.unreliable { color
 
 def write(frame: Frame) -> str:
     """The whole page, one section for each block."""
-    notes = [f"<sup>{letter}</sup> {escape(text)}" for letter, text in frame.footnotes.items()]
     return "\n".join(
         [
             "<!DOCTYPE html>",
@@ -29,7 +28,7 @@ def write(frame: Frame) -> str:
             f"<h1>{escape(frame.title)}</h1>",
             f"<p>Source of quoted numbers: {escape(frame.source)}.</p>",
             *(_block(frame, block) for block in frame.blocks),
-            *(f"<p>{note}</p>" for note in notes),
+            *_footnotes(frame),
             "<ul>" + "".join(f"<li>{escape(note)}</li>" for note in frame.notes) + "</ul>",
             "</body></html>\n",
         ]
@@ -37,8 +36,12 @@ def write(frame: Frame) -> str:
 
 
 def fragment(frame: Frame) -> str:
-    """The tables alone, one for each block, without a page around them."""
-    return "\n".join(_table(frame, block) for block in frame.blocks) + "\n"
+    """The tables alone, one for each block, and what their letters mean, without a page around them."""
+    return "\n".join([*(_table(frame, block) for block in frame.blocks), *_footnotes(frame)]) + "\n"
+
+
+def _footnotes(frame: Frame) -> list[str]:
+    return [f"<p><sup>{letter}</sup> {escape(text)}</p>" for letter, text in frame.footnotes.items()]
 
 
 def _block(frame: Frame, block: Block) -> str:

@@ -16,14 +16,19 @@ def write(frame: Frame) -> str:
     lines = [f"## {plain(frame.title)}", "", f"Source of quoted numbers: {plain(frame.source)}.", ""]
     for block in frame.blocks:
         lines += [*_block(frame, block), ""]
-    lines += [f"<sup>{letter}</sup> {plain(text)}  " for letter, text in frame.footnotes.items()]
+    lines += _footnotes(frame)
     lines += ["", *(f"- {plain(note)}" for note in frame.notes)]
     return "\n".join(lines).rstrip() + "\n"
 
 
+def _footnotes(frame: Frame) -> list[str]:
+    return [f"<sup>{letter}</sup> {plain(text)}  " for letter, text in frame.footnotes.items()]
+
+
 def fragment(frame: Frame) -> str:
-    """The tables alone, one for each block."""
-    return "\n\n".join("\n".join(_table(frame, block)) for block in frame.blocks) + "\n"
+    """The tables alone, one for each block, and what their letters mean."""
+    tables = ["\n".join(_table(frame, block)) for block in frame.blocks]
+    return "\n\n".join([*tables, *(["\n".join(_footnotes(frame))] if frame.footnotes else [])]) + "\n"
 
 
 def _block(frame: Frame, block: Block) -> list[str]:

@@ -150,6 +150,14 @@ def test_switches_leave_the_name_and_nothing_else_does(label, name, switches):
     assert split_label(label) == (name, switches)
 
 
+def test_a_fragment_says_what_its_letters_mean():
+    frame = build_frame(TABLE1, random_runs(1), choice=Choice(("ours", "ours (levels=(64, 128), inpaint.on=False)")))
+    for writer in (table_latex, table_markdown, table_html):
+        text = writer.fragment(frame)
+        for letter, words in frame.footnotes.items():
+            assert re.search(rf"(<sup>|superscript{{){letter}(</sup>|}}) {words.split()[0][:6]}", text)
+
+
 def test_rows_are_short_in_latex_and_the_switches_stand_below(tmp_path):
     text = latex.write(sweep(tmp_path))
     rows = [line for line in text.splitlines() if line.endswith(r"\\") and line.startswith("ours")]
@@ -249,6 +257,7 @@ def test_measured_blocks_are_there_for_every_region():
     titles = [block.title for block in frame.blocks[1:]]
     assert [title.rpartition(", ")[2] for title in titles] == ["region body", "region hidden"]
     assert {row.label for row in frame.blocks[1].rows} >= {"We", "theirs", "truth"}
+    assert build_frame(TABLE1, runs, choice=Choice(regions=("body", "body"))).blocks[2:] == ()
     only = build_frame(TABLE1, runs, choice=Choice(("theirs",)))
     assert [[row.label for row in block.rows] for block in only.blocks] == [["theirs"]]
 
