@@ -35,7 +35,7 @@ class BodyPose:
     def __post_init__(self) -> None:
         """Raises `BadValue` for other shapes, and for angles that can only be degrees."""
         for name, value in (("pose", self.pose), ("betas", self.betas), ("transl", self.transl)):
-            value = np.array(value.detach().cpu() if hasattr(value, "detach") else value, dtype=np.float64)
+            value = np.array(value.detach().cpu().double().numpy() if hasattr(value, "detach") else value, np.float64)
             value.setflags(write=False)
             object.__setattr__(self, name, value)
         if self.pose.shape != (24, 3) or self.betas.ndim != 1 or self.transl.shape != (3,):

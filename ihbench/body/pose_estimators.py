@@ -166,7 +166,9 @@ def from_easymocap(
     """
     values = _numbers("EasyMocap poses", poses, None).reshape(-1)
     if values.size not in (69, 72):
-        hint = "; these are SMPL-X or SMPL-H poses, fit with --body smpl" if values.size in SMPLX_SIZES else ""
+        hint = pose_hint(np.shape(poses))
+        if values.size in SMPLX_SIZES:
+            hint = "; these are SMPL-X or SMPL-H poses, fit with --body smpl"
         raise BadInput(f"EasyMocap poses: expected 72 numbers (or 69 without the root), got {values.size}{hint}")
     rotation, translation = (_numbers(name, value, (3,)) for name, value in (("Rh", Rh), ("Th", Th)))
     return from_zju_root(values, _betas(shapes), rotation, translation, body)

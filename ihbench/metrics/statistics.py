@@ -211,7 +211,10 @@ def smallest_detectable_difference(differences: Sequence[float], alpha: float = 
     deviation = float(np.std(values, ddof=1))
     if deviation == 0:
         return 0.0
-    critical = stats.t.ppf(1 - alpha / 2, n - 1) ** 2
+    quantile = float(stats.t.ppf(1 - alpha / 2, n - 1))
+    if not quantile < ORDINARY[1]:
+        return math.nan
+    critical = quantile**2
 
     def missing(noncentrality: float) -> float:
         # t² is F: scipy's noncentral t is NaN in the far tail that a two-sided test needs, its noncentral F is not

@@ -169,7 +169,13 @@ def _check(
             )
         if colors.shape[1] == 3 and 16 < brightest < 256:
             raise ValueError(f"splats: colors: expected values in 0..1, got up to {brightest:.4g}; divide by 255")
-    background = torch.as_tensor(background, dtype=torch.float64).detach().to(means.device)
+    try:
+        background = torch.as_tensor(background, dtype=torch.float64).detach()
+    except (TypeError, ValueError):
+        raise ValueError(f"splat background: expected numbers in 0..1, got {background!r}") from None
+    if colors.shape[1] == 3 and background.numel() and 16 < float(background.max()) < 256:
+        raise ValueError(f"splat background: expected values in 0..1, got {background.tolist()}; divide by 255")
+    background = background.to(means.device)
     channels = colors.shape[1]
     if background.numel() not in (1, channels):
         raise ValueError(f"splat background: expected 1 or {channels} values, got {background.numel()}")

@@ -267,6 +267,7 @@ def test_easymocap_puts_every_vertex_where_it_does():
     ("change", "text"),
     [
         ({"poses": np.zeros(87)}, "SMPL-X"),
+        ({"poses": np.zeros((2, 72))}, "2 frames or persons"),
         ({"poses": np.zeros(66)}, "72 numbers"),
         ({"poses": np.ones(72)}, "Rh holds the root"),
         ({"poses": np.full(72, np.inf)}, "infinity"),

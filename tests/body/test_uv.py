@@ -171,3 +171,5 @@ def test_other_shapes_are_refused():
 def test_other_poses_are_refused(pose, word):
     with pytest.raises(ValueError, match=word):
         BodyPose(pose, np.zeros(10), np.zeros(3))
+    rest = torch.zeros(24, 3, requires_grad=True)
+    assert BodyPose(rest, torch.zeros(10).bfloat16(), torch.zeros(3)).pose.dtype == np.float64

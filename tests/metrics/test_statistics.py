@@ -498,6 +498,10 @@ def test_medians_of_infinities_of_both_signs(no_warning, values, middle):
     assert (interval.method == "no median between -inf and inf") == math.isnan(middle)
 
 
+def test_a_test_that_nothing_passes_detects_no_difference(no_warning):
+    assert math.isnan(smallest_detectable_difference([1.0, 2.0, 4.0], alpha=1e-300))
+
+
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("n", [3, 9])
 def test_interval_ends_of_what_is_not_finite_are_refused(no_warning, bad, n):

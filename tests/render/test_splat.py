@@ -245,6 +245,8 @@ def test_bad_input_is_named():
         ((means, scales[:, None].expand(-1, 3), colors, camera), "one scale each"),
         ((means.T, scales, colors, camera), "transpose"),
         ((means, scales, colors, camera.K), "Camera"),
+        ((means, scales, colors, camera, (255, 255, 255)), "background.*divide by 255"),
+        ((means, scales, colors, camera, "white"), "background.*numbers"),
         ((means[0, 0], scales, colors, camera), "expected means"),
     ):
         with pytest.raises(ValueError, match=word):
