@@ -75,7 +75,7 @@ def curtain(monkeypatch):
 # ------------------------------------------------------------------------------------------------ training
 
 
-@pytest.mark.parametrize("size", [96, 48, 40])
+@pytest.mark.parametrize("size", [150, 96, 48, 40])
 @pytest.mark.parametrize("base", ["custom_occ", "zju_occ_occnerf", "people_snapshot"])  # area, lanczos4, linear
 @pytest.mark.parametrize("distortion", [None, DISTORTION, PINCUSHION], ids=["pinhole", "barrel", "pincushion"])
 def test_no_training_pixel_inside_the_body_and_outside_the_mask_is_background(distortion, base, size):
