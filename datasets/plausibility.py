@@ -30,10 +30,11 @@ SIDE = 224  # px, longest side at which bodies and masks are compared
 NEAREST, FARTHEST = 0.05, 100.0  # m; nobody films a person from there
 CLOTHES = 0.03  # of the drawn body's height: how far garments and hair may stand off it
 CLEARLY = 0.2  # how much more overlap tells that a change of the masks is what they need
-SHIFTS = (1, 2, 3, 5, 10)  # frames by which masks and poses are tried against each other
+SHIFTS = (1, 2, 3, 4, 5, 7, 10)  # frames by which masks and poses are tried against each other
 WAYS = {"later": 1, "earlier": -1}
 CERTAIN = 0.08  # gain in overlap from which another order of the frames, or another place, is no chance
 STEADY = 0.8  # share of the compared views in which a shift must fit better
+LISTED = 3  # problems of one kind that are spelled out
 SMALL = 20  # px, height of a person below which little can be learned
 SOFT_VALUES = 32  # different grey values of a mask from which it is a matte and no label image
 
@@ -163,11 +164,11 @@ def examine(
         frames = sorted({frame for _, frame in views}) or list(
             range(0, capture.n_frames, max(1, capture.n_frames // 3))
         )
-        posed = _posed(frames, outline, report)
+        posed = _usable(frames, outline, lambda frame: f"frame {capture.label(frame)}", report)
         plausible = _check_shape(capture, report)
         aimed = set(_check_placement(capture, usable, list(posed.values())[:: max(1, len(posed) // 8)], report))
     _check_images(capture, views, samples, found, report)
-    masks = _masks(capture, views, report)
+    masks = _usable(views, lambda v: capture.silhouette(*v), lambda v: _views(capture, [v]), report)
     if not masks:
         return
     _check_softness(capture, masks, report)
@@ -205,14 +206,19 @@ def _evenly(items: Sequence[Any], count: int) -> list[Any]:
     return [items[k] for k in sorted(set(picked.tolist()))]
 
 
-def _posed(frames: Iterable[int], outline: Callable[[int], Outline], report: Report) -> dict[int, Outline]:
-    posed = {}
-    for frame in frames:
+def _usable(items: Iterable[Any], read: Callable[[Any], Any], name: Callable[[Any], str], report: Report) -> dict:
+    """What can be read of the items, by item. The first few that cannot are named, the others counted."""
+    usable, errors = {}, {}
+    for item in items:
         try:
-            posed[frame] = outline(frame)
+            usable[item] = read(item)
         except BadInput as error:
-            report.problem(str(error))
-    return posed
+            errors.setdefault(str(error), item)
+    for text, item in list(errors.items())[:LISTED]:
+        report.problem(text if "/" in text else f"{name(item)}: {text}")
+    if len(errors) > LISTED:
+        report.problem(f"and so on: {len(errors)} such of {len(usable) + len(errors)} looked at")
+    return usable
 
 
 # ----------------------------------------------------------------------------------------- cameras, poses
@@ -367,8 +373,7 @@ def _check_poses(capture: CaptureFolder, report: Report) -> None:
     largest = max(float(np.abs(pose.betas).max(initial=0)) for pose in poses.values())
     if largest > 6:
         report.warn(f"a shape coefficient of {largest:.3g}; bodies of people have betas of about -3 to 3")
-    parameters = np.stack([np.concatenate([p.pose.ravel(), p.transl]) for p in poses.values()])
-    if len(poses) > 2 and np.ptp(parameters, axis=0).max() < 1e-9:
+    if len(poses) > 2 and np.ptp([pose.pose for pose in poses.values()], axis=0).max() < 1e-9:
         still = _masks_stand_still(capture, [frame for frame in frames if not capture.lacks(0, frame)])
         text = f"all {len(poses)} poses looked at are the same"
         if still:
@@ -443,16 +448,6 @@ def _check_images(
             )
     found["sampled_images"] = decoded_images
     found["image_size"] = sorted([list(size) for size in sizes])
-
-
-def _masks(capture: CaptureFolder, views: Sequence[tuple[int, int]], report: Report) -> dict[tuple[int, int], Mask]:
-    masks = {}
-    for camera, frame in views:
-        try:
-            masks[camera, frame] = capture.silhouette(camera, frame)
-        except BadInput as error:
-            report.problem(str(error))
-    return masks
 
 
 def _check_softness(capture: CaptureFolder, masks: dict[tuple[int, int], Mask], report: Report) -> None:
@@ -615,6 +610,8 @@ def _check_fit(
     visible = [fit for fit in fits if fit.area > 0]
     if not visible:
         return
+    if whole is False and (empty := [(fit.camera, fit.frame) for fit in fits if fit.area == 0]):
+        report.warn(f"{len(empty)} of {len(fits)} masks looked at are empty ({_views(capture, empty)})")
     inside = found["vertices_in_mask"] = round(float(np.mean([fit.vertices_in_mask for fit in visible])), 4)
     covered = found["mask_on_body"] = round(float(np.mean([fit.mask_on_body for fit in visible])), 4)
     low = [fit for fit in visible if len(fit.iou) > 1]
@@ -658,10 +655,14 @@ def _check_single_views(capture: CaptureFolder, fits: Sequence[Overlap], whole: 
         off = fit.area > 0.05 * fit.body_area and fit.mask_on_body < 0.5
         bad = empty or off or (whole is True and fit.vertices_in_mask < 0.5)
         (out if bad else others).append(fit)
-    if not out or len(out) > 0.4 * len(fits) or np.mean([fit.mask_on_body for fit in others]) < 0.85:
+    if not out or len(out) > 0.4 * len(fits):
+        return False
+    fitting = np.mean([[fit.mask_on_body, fit.vertices_in_mask if whole else 1] for fit in others], axis=0)
+    if fitting.min() < 0.85:
         return False
     worst = min(out, key=lambda fit: fit.mask_on_body if fit.area else 0)
-    state = f"lies on the body by {worst.mask_on_body:.0%}" if worst.area else "is empty"
+    state = f"has {worst.mask_on_body:.0%} on the body, and {worst.vertices_in_mask:.0%} of it"
+    state = state if worst.area else "is empty"
     state = "covers the whole picture" if worst.area > 0.98 else state
     report.problem(
         f"{len(out)} of {len(fits)} masks looked at do not show the body of their frame "
@@ -674,7 +675,7 @@ def _check_single_views(capture: CaptureFolder, fits: Sequence[Overlap], whole: 
 def _unlike(fits: Sequence[Overlap], covered: float, inside: float) -> str:
     """What the masks have that the bodies lack, where no single change helps."""
     share, body = (float(np.median([getattr(fit, name) for fit in fits])) for name in ("area", "body_area"))
-    if covered < 0.9 and inside > 0.85 and share > 1.1 * body:
+    if covered < 0.9 and (share > 1.1 * body if inside > 0.85 else inside > 0.6 and share > body * inside):
         return (
             f"the masks make {share:.0%} of the pictures a person, the body is {body:.0%}; other people, things or a "
             f"soft matte's haze may be in them"

@@ -168,6 +168,12 @@ SNAPSHOT_DAMAGES = {
     "NaN": (lambda f: edit_poses(f, "pose", lambda p: np.where(np.arange(72) == 5, np.nan, p)), "NaN"),
     "millimetres": (lambda f: edit_poses(f, "trans", lambda t: 1000 * t), "millimetres"),
     "no focal length": (camera_without_focal, "camera_f"),
+    "degrees": (lambda f: edit_poses(f, "pose", np.degrees), "and so on: 6 such of 6 looked at"),
+    "frozen": (
+        lambda f: edit_poses(f, "pose", lambda p: np.repeat(p[:1], len(p), 0)),
+        "poses looked at are the same",
+    ),
+    "betas": (lambda f: edit_poses(f, "betas", lambda b: b + 20), "its betas make a body of"),
     "hostile": (hostile, "camera.pkl"),
 }
 
@@ -203,6 +209,13 @@ OCMOTION_DAMAGES = {
         "divide 'trans' by 1000",
     ),
     "no entry": (lambda f: rewrite(f, lambda w: w.pop("00003")), "00003"),
+    "somebody else": (lambda f: edit_masks(f, lambda m: np.maximum(m, np.roll(m, 80, 1))), "other people, things"),
+    "focal length": (
+        lambda f: rewrite(
+            f, lambda w: [e.update(cam_intrinsics=[[9, 0, 120], [0, 9, 90], [0, 0, 1]]) for e in w.values()]
+        ),
+        "focal length 9 px for 240×180 px",
+    ),
     "twice": (lambda f: shutil.copy(f / "images" / "00001.png", f / "images" / "00001.jpg"), "00001"),
     "not JSON": (lambda f: cut(f / "metadata.json"), "metadata.json"),
     "infinite": (lambda f: rewrite(f, lambda w: w["00001"].update(trans=[0, 0, float("inf")])), "trans"),
