@@ -59,6 +59,11 @@ def rival(file, kind):
     return process
 
 
+def grow_old(owner):
+    long_ago = time.time() - 2 * locks.STALE
+    os.utime(owner, (long_ago, long_ago))
+
+
 def refused(file):
     with pytest.raises(BadInput, match="being written by") as error, locked(file, "go elsewhere"):
         pass
@@ -116,7 +121,7 @@ def test_a_claim_that_nobody_understands_counts_until_it_is_old(file, kind, word
     owner = file.with_name("lock.owner")
     owner.write_text(words)
     assert "another process" in refused(file)
-    os.utime(owner, (time.time() - 2 * locks.STALE,) * 2)
+    grow_old(owner)
     with locked(file, ""):
         assert json.loads(owner.read_text())["process"] == os.getpid()
 
@@ -144,7 +149,7 @@ def test_another_machine_is_believed_while_it_renews_its_claim(file, kind, monke
         words = owner.read_text()
     owner.write_text(words)  # killed there; the lock is free
     assert is_held(file)
-    os.utime(owner, (time.time() - 2 * locks.STALE,) * 2)
+    grow_old(owner)
     assert not is_held(file)
     with locked(file, ""):
         pass
