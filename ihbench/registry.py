@@ -50,6 +50,24 @@ def _found(kind: str) -> dict[str, EntryPoint]:
     return {point.name: point for point in sorted(entry_points(group=GROUPS[kind]), key=lambda p: p.name)}
 
 
+@cache
+def clashes(kind: str) -> dict[str, str]:
+    """Names that several distributions give to different things -> one line: which, and what to do.
+
+    None of them is taken: which one came last would depend on the order of installation. A distribution that lies in
+    several places of the path counts once, as for Python, and so do several names of one object.
+    """
+    found: dict[str, dict[str, str]] = {}
+    for point in entry_points(group=GROUPS[kind]):
+        found.setdefault(point.name, {})[point.value] = point.dist.name if point.dist is not None else point.module
+    return {
+        name: f"registered by {' and by '.join(f'{who} ({what})' for what, who in sorted(makers.items()))}; "
+        "uninstall all but one of these packages, or have theirs renamed"
+        for name, makers in sorted(found.items())
+        if len(makers) > 1
+    }
+
+
 def names(kind: str) -> list[str]:
     """Registered names of a kind, sorted."""
     return list(_found(kind))
@@ -63,8 +81,10 @@ def nearest(name: str, known: list[str]) -> str:
 
 
 def entry_point(kind: str, name: str) -> EntryPoint:
-    """The entry point itself. Raises `BadInput` with the nearest known name."""
+    """The entry point itself. Raises `BadInput` for a name of several, and with the nearest known name."""
     found = _found(kind)
+    if name in clashes(kind):
+        raise BadInput(f"{kind} {name!r} is {clashes(kind)[name]}")
     if name not in found:
         raise BadInput(f"unknown {kind} {name!r}: {nearest(name, list(found))}")
     return found[name]
@@ -113,17 +133,21 @@ def package_folder(kind: str, name: str) -> Path:
     raise BadInput(f"{kind} {name!r}: its package {module!r} cannot be found")
 
 
+def room(name: str) -> Path:
+    """The folder of one of `ROOMS`."""
+    spec = find_spec(f"ihbench.{name}")
+    if spec is None or not spec.submodule_search_locations:
+        raise BadInput(f"ihbench.{name} cannot be found; install ihbench again")
+    return Path(next(iter(spec.submodule_search_locations)))
+
+
 def source(kind: str, name: str) -> Path:
     """The folder or file with the code behind a name: of another distribution its top package or module, whole; of
     one of the bench's rooms the package that registers the name; else the bench. Imports none of them."""
     module = entry_point(kind, name).module
     top, *inner = module.split(".")
-    if top == "ihbench" and inner:
-        spec = find_spec(f"{top}.{inner[0]}")
-        places = list(spec.submodule_search_locations or ()) if spec is not None else []
-        if not places or inner[0] not in ROOMS:
-            return Path(__file__).parent
-        return _deepest(Path(places[0]), inner[1:])
+    if top == "ihbench":
+        return _deepest(room(inner[0]), inner[1:]) if inner and inner[0] in ROOMS else Path(__file__).parent
     spec = find_spec(top)
     if spec is not None and spec.origin is not None:
         origin = Path(spec.origin)

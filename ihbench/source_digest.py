@@ -6,7 +6,8 @@ line break changes nothing, everything else does. The tree is written out by thi
 modules) are hashed as they are. Nothing is imported.
 
 Which source: all of the bench but what `NOT_IN_NUMBERS` names, and the packages that register the method, the data
-set, the occlusion rules and the metric presets of a run, whole. A new file is in by default.
+set, the occlusion rules and the metric presets of a run, whole; where another distribution's package imports one of
+the bench's rooms, that too. A new file is in by default.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ import ast
 import gc
 import hashlib
 import os
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterable, Iterator, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -33,10 +35,12 @@ NOT_IN_NUMBERS = (
     "commands/*", "kernels/*", "stress/*", "cli.py", "progress.py", "errors.py", "registry.py",
     "ablation.py", "cells.py", "earlier_runs.py", "index.py", "quality_time.py",
     "contact_sheet.py", "diagram.py", "splat_ply.py", "prepare.py", "row_choice.py", "row_labels.py",
+    "api.py", "repeat.py", "gpu_slots.py", "failures.py", "streams.py",
     "machine.py", "provenance.py", "threads.py",
     "metrics/check.py", "metrics/cases.py", "metrics/*oracle.py", "metrics/reference_values.py",
 )  # fmt: skip
 DESCRIPTIONS = ("*.md", "*.rst", "*.typed", "*~", ".*", "card.toml")
+ROOM_NAME = re.compile(rb"ihbench\.(methods|datasets|protocols)\.(\w+)")
 LARGE = 64 * 2**20  # bytes; of larger files, which are weights, only the ends are read
 ENDS = 2**16  # bytes
 LENGTH = 8  # hex digits
@@ -46,8 +50,7 @@ _known: dict[str, tuple[tuple[int, int, int], bytes]] = {}  # path -> state of t
 
 def code_of(protocol: Protocol, method: str) -> str:
     """What a run's identity says of its code: version, hash of the method's package, hash of the bench."""
-    roots = dict.fromkeys(registry.source(kind, method).resolve() for kind in ("method", "config"))
-    own = "-".join(tree_digest(root) for root in roots)
+    own = _digest_of([("method", method), ("config", method)])
     return f"{__version__}+{own}+{bench_code(protocol)}"
 
 
@@ -57,10 +60,31 @@ def bench_code(protocol: Protocol, presets: Sequence[str] | None = None) -> str:
     rules = dict.fromkeys((protocol.occlusion.rule, protocol.occlusion.unlisted))
     parts = [("dataset", protocol.dataset), *(("occlusion", rule) for rule in rules)]
     parts += [("metric preset", name) for name in (protocol.presets if presets is None else presets)]
-    roots = dict.fromkeys(registry.source(kind, name).resolve() for kind, name in parts)
-    digests = [tree_digest(BENCH, NOT_IN_NUMBERS)]
-    digests += sorted(tree_digest(root) for root in roots if root != BENCH)
-    return hashlib.sha256(" ".join(digests).encode()).hexdigest()[:LENGTH]
+    return hashlib.sha256(f"{tree_digest(BENCH, NOT_IN_NUMBERS)} {_digest_of(parts)}".encode()).hexdigest()[:LENGTH]
+
+
+def _digest_of(parts: Iterable[tuple[str, str]]) -> str:
+    """Hash of the packages that register these names, and of those of the bench's rooms that they name."""
+    roots: dict[Path, None] = {}
+    for kind, name in parts:
+        root = registry.source(kind, name).resolve()
+        if root != BENCH and root not in roots:
+            roots |= dict.fromkeys([root, *_rooms_named(root)])
+    digests = sorted({tree_digest(root) for root in roots})
+    return digests[0] if len(digests) == 1 else hashlib.sha256(" ".join(digests).encode()).hexdigest()[:LENGTH]
+
+
+def _rooms_named(root: Path) -> list[Path]:
+    """Packages of the bench's rooms that other people's source imports: their method may be built on ours."""
+    rooms = {room: registry.room(room).resolve() for room in registry.ROOMS}
+    if any(root == room or room in root.parents for room in rooms.values()):
+        return []  # of the bench itself: rooms do not import each other
+    named = set()
+    for name, path in _files(root, ()):
+        if name.endswith(".py"):
+            named |= {match.groups() for match in ROOM_NAME.finditer(path.read_bytes())}
+    found = [rooms[room.decode()] / inner.decode() for room, inner in named]
+    return sorted({path if path.is_dir() else path.parent for path in found})
 
 
 def tree_digest(root: Path, leave_out: Sequence[str] = ()) -> str:

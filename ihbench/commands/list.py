@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import tyro
 
 from ihbench import registry
+from ihbench.cli import COMMANDS
 from ihbench.commands.parse import options
 from ihbench.errors import BadInput
 from ihbench.files.regular import read_toml
@@ -31,6 +33,8 @@ def main(argv: list[str]) -> int:
     chosen = options(ListOptions, argv, "list", "What is registered, one line each.")
     kinds = KINDS if chosen.kind == "all" else (chosen.kind,)
     found = {kind: _DESCRIBE[kind]() for kind in kinds}
+    if chosen.kind == "all":
+        found |= _clashes()
     if chosen.json:
         print(json.dumps(found))
         return 0
@@ -43,39 +47,58 @@ def main(argv: list[str]) -> int:
 
 
 def _methods() -> dict[str, str]:
-    about = {}
-    for name in registry.names("method"):
-        card = registry.package_folder("method", name) / "card.toml"
-        words = read_toml(card, "the method's card") if card.is_file() else {}
-        about[name] = str(words.get("summary", words.get("title", "")))
-    return about
+    return _each("method", lambda name: (name, _summary(name)))
+
+
+def _summary(name: str) -> str:
+    card = registry.package_folder("method", name) / "card.toml"
+    words = read_toml(card, "the method's card") if card.is_file() else {}
+    return str(words.get("summary", words.get("title", "")))
 
 
 def _datasets() -> dict[str, str]:
     standins = registry.names("stand-in")
-    return {name: "with a stand-in" if name in standins else "" for name in registry.names("dataset")}
+    return _each("dataset", lambda name: (name, "with a stand-in" if name in standins else ""))
 
 
 def _protocols() -> dict[str, str]:
-    about = {}
-    for name in registry.names("protocol"):
-        try:
-            protocol = load_protocol(name)
-            about[protocol.name] = protocol.title
-        except BadInput as error:  # of another package: it must not take the others away
-            about[name] = str(error)
-    return about
+    return _each("protocol", lambda name: ((p := load_protocol(name)).name, p.title))
 
 
 def _reports() -> dict[str, str]:
-    return {name: "" for name in registry.names("report")}
+    return _each("report", lambda name: (name, ""))
+
+
+def _each(kind: str, describe: Callable[[str], tuple[str, str]]) -> dict[str, str]:
+    """Every registered name as it is listed, with a word about it; or with what is wrong with it."""
+    found = {}
+    for name in registry.names(kind):
+        try:
+            registry.entry_point(kind, name)
+            listed, about = describe(name)
+        except (BadInput, ImportError, OSError, ValueError) as error:
+            listed, about = name, f"cannot be used: {error}"
+        found[listed] = about
+    return found
+
+
+def _clashes() -> dict[str, dict[str, str]]:
+    """Names of any kind that several packages claim."""
+    told = {f"{kind} {name}": why for kind in registry.GROUPS for name, why in registry.clashes(kind).items()}
+    hidden = "is registered by another package; the bench's own is the one that runs"
+    told |= {f"command {name}": hidden for name in registry.names("command") if name in COMMANDS}
+    return {"clashes": told} if told else {}
 
 
 def _metrics() -> dict[str, str]:
     """Each preset, and after it each of its identity strings with the definition in a line."""
     found = {}
     for name in registry.names("metric preset"):
-        preset = registry.load("metric preset", name)
+        try:
+            preset = registry.load("metric preset", name)
+        except BadInput as error:
+            found[name] = f"cannot be used: {error}"
+            continue
         found[name] = f"{preset.about} [{preset.source}]"
         for measure in preset.measures:
             regions = "" if measure.regions is None else f" (over {', '.join(measure.regions)})"

@@ -25,7 +25,17 @@ from tests.bench.test_house import imports
 ROOT = Path(__file__).resolve().parents[2]
 ROOMS = ("ihbench", *registry.ROOMS)
 # of what is left out, the modules that code with numbers may use: they say, find, measure or show
-HARMLESS = {"errors", "registry", "progress", "machine", "threads", "provenance", "contact_sheet"}
+HARMLESS = {
+    "failures",
+    "streams",
+    "errors",
+    "registry",
+    "progress",
+    "machine",
+    "threads",
+    "provenance",
+    "contact_sheet",
+}
 
 OF_THE_BENCH = [
     *("ihbench/render/splat.py", "ihbench/render/splat_numba.py", "ihbench/render/zbuffer.py"),
@@ -222,6 +232,29 @@ def test_the_source_of_another_distribution_counts(tmp_path, monkeypatch, kind, 
     source_digest._known.clear()
     assert tree_digest(where) != before
     assert module not in sys.modules
+
+
+def test_a_method_of_others_that_is_built_on_ours_counts_ours(checkout, tmp_path, monkeypatch):
+    package = tmp_path / "theirs_on_ours"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "method.py").write_text("from ihbench.methods.inpainthuman.method import InpaintHuman")
+    found, source = registry._found, registry.source
+    points = {
+        kind: EntryPoint("theirs", "theirs_on_ours.method:M", registry.GROUPS[kind]) for kind in ("method", "config")
+    }
+    monkeypatch.setattr(registry, "_found", lambda k: found(k) | ({"theirs": points[k]} if k in points else {}))
+    monkeypatch.setattr(registry, "source", lambda kind, name: package if name == "theirs" else source(kind, name))
+    monkeypatch.setattr(registry, "room", lambda name: checkout / name)
+    before = code_of(load_protocol("zju_occ"), "theirs")
+    stage = checkout / "methods" / "inpainthuman" / "stage1.py"
+    text = stage.read_text()
+    stage.write_text(text + "\nx = 1\n")
+    source_digest._known.pop(str(stage), None)
+    after = code_of(load_protocol("zju_occ"), "theirs")
+    stage.write_text(text)
+    source_digest._known.pop(str(stage), None)
+    assert after != before == code_of(load_protocol("zju_occ"), "theirs")
 
 
 # ------------------------------------------------------------------------------------- who asks for it
