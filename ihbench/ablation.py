@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Any
 
+from ihbench.bounds import refuse_repeated
 from ihbench.config_fields import flat, with_fields
 from ihbench.errors import BadInput
 
@@ -55,10 +56,9 @@ class Ladder:
 
 
 def grid(config: Any, vary: Mapping[str, Sequence[Any]]) -> Ladder:
-    """All combinations of the values of some switches; every one is compared with the first. A value given twice
-    counts once.
+    """All combinations of the values of some switches; every one is compared with the first.
 
-    Raises `BadInput` for a switch that the configuration does not have, and for one without values.
+    Raises `BadInput` for a switch that the configuration does not have, one without values, and a value given twice.
     """
     known = flat(config)
     for name, values in vary.items():
@@ -66,7 +66,8 @@ def grid(config: Any, vary: Mapping[str, Sequence[Any]]) -> Ladder:
             raise BadInput(f"--vary {name}: no such switch")
         if not values:
             raise BadInput(f"--vary {name}: expected a value or more")
-    combinations = product(*(dict.fromkeys(values) for values in vary.values()))
+        refuse_repeated(values, f"--vary {name}")
+    combinations = product(*vary.values())
     grids = [dict(zip(vary, values, strict=True)) for values in combinations]
     rungs = [Rung(name, switches) for name, switches in zip(_names(grids), grids, strict=True)]
     first = rungs[0].name

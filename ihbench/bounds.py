@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import types
 import unicodedata
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from pathlib import Path
@@ -19,6 +20,7 @@ from ihbench.errors import BadInput
 LONGEST_TEXT = 1000  # characters
 LARGEST_CAST = 99  # people of a stand-in that can be named, whether a protocol names them or not
 IMAGE_SIZES = (8, 8192)  # px of the longer side
+LARGEST_SEED = 2**32 - 1  # what every generator of random numbers takes, numpy's old one as well
 STEPS = 10_000_000  # of an optimisation, at most
 WHOLE = re.compile(r"-?[0-9]{1,19}")
 REAL = re.compile(r"-?([0-9]+(\.[0-9]*)?|\.[0-9]+)(e[-+]?[0-9]{1,3})?|-?inf|nan", re.IGNORECASE)
@@ -56,6 +58,7 @@ class MultipleOf:
         return f"a multiple of {self.divisor}"
 
 
+SEEDS = Within(0, LARGEST_SEED)
 ANY_NUMBER = Within(-(2**63), 2**63 - 1, words="a finite number, below 2^63")
 
 
@@ -82,13 +85,16 @@ def plain(text: str) -> str:
     return text
 
 
-def check(values: Any, prefix: str = "--") -> None:
-    """Hold every field of a dataclass, and of those in it, against its type and bounds.
+def check(values: Any, prefix: str = "--", only: Collection[str] | None = None) -> None:
+    """Hold every field of a dataclass (or some), and of those in it, against its type and bounds.
 
-    `prefix` stands before the field's name in what is said of it. Raises `BadInput` for the first that does not fit.
+    `prefix` stands before the field's name in what is said of it; without one that is an argument's. Raises
+    `BadInput` for the first that does not fit.
     """
     for name, hint, default in _fields(type(values)):
-        value, flag = getattr(values, name), prefix + _flag(name, hint)
+        if only is not None and name not in only:
+            continue
+        value, flag = getattr(values, name), (prefix + _flag(name, hint) if prefix else name)
         if is_dataclass(value) and not isinstance(value, type):
             check(value, f"{flag}.")
             continue
@@ -103,6 +109,13 @@ def check(values: Any, prefix: str = "--") -> None:
                     if not rule.holds(item):
                         told = " and ".join(str(other) for other in bounds)
                         raise BadInput(f"{flag} {shown(value)}: expected {told}")
+
+
+def refuse_repeated(values: Sequence[Any], flag: str) -> None:
+    """Raise `BadInput` where a list that says what to do has something twice: a slip, and nothing to do twice."""
+    for k, value in enumerate(values):
+        if value in values[:k]:
+            raise BadInput(f"{flag} {shown(tuple(values))}: {shown(value)} stands there twice; name each once")
 
 
 def fits(value: Any, hint: Any) -> bool:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from ihbench import registry
 from ihbench.body import Body, load_body
-from ihbench.bounds import LARGEST_CAST
+from ihbench.bounds import LARGEST_CAST, refuse_repeated
 from ihbench.errors import BadInput
 from ihbench.paths import path_from, user_path, users_cache
 from ihbench.progress import Progress
@@ -59,24 +59,35 @@ class DataSource:
     scenes: tuple[str, ...]
 
     def open(self, scene: str, body: Path | None, progress: Progress) -> tuple[Capture, Body]:
-        """One capture and the body model of its poses. Makes the stand-in's missing images first."""
+        """One capture and the body model of its poses. Makes the stand-in's missing images first.
+
+        Raises `BadInput` where the capture does not have the views that the protocol asks for.
+        """
         if self.is_standin:
             self.make_standin([scene], progress)
-        return open_capture(self.protocol.dataset, self.root, scene, body)
+        capture, model = open_capture(self.protocol.dataset, self.root, scene, body)
+        where = f"{capture.dataset} {capture.name}"
+        self.protocol.check_views(capture.name, capture.n_frames, len(capture.camera_ids), where)
+        return capture, model
 
     def test_keys(self, scene: str) -> tuple[TestViewKey, ...]:
-        """The test views of a scene. No image is read, and none made of a stand-in."""
+        """The test views of a scene. No image is read, and none made of a stand-in. Raises `BadInput` as `open`."""
         from ihbench.views import test_view_keys
 
         if self.is_standin:
             standin = registry.load("stand-in", self.protocol.dataset)
-            return test_view_keys(self.protocol, scene, standin.n_frames, standin.camera_ids(scene))
-        capture = registry.load("dataset", self.protocol.dataset)(self.root).open(scene)
-        return test_view_keys(self.protocol, scene, capture.n_frames, capture.camera_ids)
+            n_frames, camera_ids = standin.n_frames, standin.camera_ids(scene)
+        else:
+            capture = registry.load("dataset", self.protocol.dataset)(self.root).open(scene)
+            n_frames, camera_ids = capture.n_frames, capture.camera_ids
+        self.protocol.check_views(scene, n_frames, len(camera_ids), f"{self.protocol.dataset} {scene}")
+        return test_view_keys(self.protocol, scene, n_frames, camera_ids)
 
     def make_standin(self, scenes: list[str], progress: Progress) -> None:
         """Write what the protocol needs of these stand-in subjects and is not there yet."""
         standin = registry.load("stand-in", self.protocol.dataset)
+        for scene in scenes:
+            self.protocol.check_views(scene, standin.n_frames, standin.n_cameras, f"stand-in {scene}")
         standin.ensure(self.root, STANDIN_SEED, scenes, wanted_frames(self.protocol, standin), progress)
 
     def exists(self, scene: str) -> bool:
@@ -196,6 +207,7 @@ def wanted_frames(protocol: Protocol, standin: type) -> dict[int, list[int]]:
 
 
 def _chosen(scenes: tuple[str, ...], known: list[str], found: list[str], where: str) -> tuple[str, ...]:
+    refuse_repeated(scenes, "--scene")
     for scene in scenes:
         if scene not in found:
             raise BadInput(f"unknown scene {scene!r} {where}: {registry.nearest(scene, found)}")

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ihbench import registry
+from ihbench.bounds import whole
 from ihbench.errors import BadInput
 from ihbench.files.regular import read_toml
 from ihbench.protocol_shape import check_protocol
@@ -35,6 +36,10 @@ class Span:
         """The indices below both `stop` (or `limit`, where stop is a name) and nothing else."""
         stop = self.stop if isinstance(self.stop, int) else limit
         return range(self.start, stop, self.step)
+
+    def below(self, limit: int) -> range:
+        """The indices that are below `limit`, too."""
+        return range(self.start, min(self.indices(limit).stop, limit), self.step)
 
 
 @dataclass(frozen=True)
@@ -195,10 +200,37 @@ class Protocol:
         replaced = _build({**self.content, "image": {**self.content["image"], "size": size}}, self.profile)
         return replace(replaced, version=f"{self.version}+size={size}")
 
+    def check_views(self, subject: str, n_frames: int, n_cameras: int, where: str) -> None:
+        """Raise `BadInput` where a capture of so many frames and cameras does not have the views that are asked for.
+
+        `where` names the capture. To be called before anything lists, reads or writes them: a span may have any size.
+        """
+        limit = self.max_frames.get(subject, n_frames)
+        cameras = self.testing_cameras(n_cameras)
+        groups = [group for group in self.also if group.cameras.below(n_cameras)]
+        train, test = self._spans_of(subject)
+        spans = {"training": train, **({"test": test} if cameras else {})}
+        spans |= {f"test ({group.name})": group.frames for group in groups}
+        for what, span in spans.items():
+            frames = span.indices(limit)
+            if not frames:
+                raise BadInput(f"{where}: {self.name} selects no {what} frame of its {n_frames}")
+            if frames[-1] >= n_frames:
+                raise BadInput(
+                    f"{where}: has {n_frames} frames, {self.name} needs frame {frames[-1]} ({what}); use a complete "
+                    "copy, another protocol, or other --train-frames and --test-frames"
+                )
+        if self.train_camera >= n_cameras:
+            raise BadInput(f"{where}: has {n_cameras} cameras, training needs camera index {self.train_camera}")
+        if not cameras and not groups:
+            raise BadInput(f"{where}: {self.name} leaves no test view ({n_cameras} cameras)")
+
+    def _spans_of(self, subject: str) -> tuple[Span, Span]:
+        return self.spans.get(subject, (self.train_frames, self.test_frames))
+
     def training_frames(self, subject: str, n_frames: int) -> list[int]:
         """Raw frame numbers of the training images."""
-        span = self.spans[subject][0] if subject in self.spans else self.train_frames
-        return list(span.indices(self.max_frames.get(subject, n_frames)))
+        return list(self._spans_of(subject)[0].indices(self.max_frames.get(subject, n_frames)))
 
     def covered(self, subject: str, frames: list[int], n_frames: int) -> list[bool]:
         """For each training frame, whether the occluder covers it.
@@ -214,12 +246,11 @@ class Protocol:
 
     def testing_cameras(self, n_cameras: int) -> list[int]:
         """Camera indices of the test views. The training camera is left out where the protocol says so."""
-        cameras = [c for c in self.test_cameras.indices(n_cameras) if c < n_cameras]
+        cameras = self.test_cameras.below(n_cameras)
         return [c for c in cameras if not (self.test_except_train and c == self.train_camera)]
 
     def testing_frames(self, subject: str, n_frames: int) -> list[int]:
-        span = self.spans[subject][1] if subject in self.spans else self.test_frames
-        return list(span.indices(self.max_frames.get(subject, n_frames)))
+        return list(self._spans_of(subject)[1].indices(self.max_frames.get(subject, n_frames)))
 
     def test_views(self, subject: str, n_frames: int, n_cameras: int) -> list[tuple[int, int, str]]:
         """(camera, frame, group) of every test view, in order; the group of the protocol's own is ""."""
@@ -230,7 +261,7 @@ class Protocol:
         ]
         limit = self.max_frames.get(subject, n_frames)
         for group in self.also:
-            cameras = [c for c in group.cameras.indices(n_cameras) if c < n_cameras]
+            cameras = group.cameras.below(n_cameras)
             views += [(camera, frame, group.name) for camera in cameras for frame in group.frames.indices(limit)]
         return views
 
@@ -320,7 +351,7 @@ def _slice(text: str, flag: str) -> dict[str, Any]:
     """A span's table from "0:500:5", "0::2" or "100:"."""
     parts = text.split(":")
     try:
-        start, stop, step = (int(part) if part else None for part in [*parts, "", ""][:3])
+        start, stop, step = (whole(part) if part else None for part in [*parts, "", ""][:3])
     except ValueError:
         start = stop = step = -1
     if len(parts) not in (2, 3) or (start or 0) < 0 or (step is not None and step < 1):

@@ -274,6 +274,14 @@ class RunFolder:
             yield
 
 
+def is_finished(runs: Path, identity: RunIdentity) -> bool:
+    """Whether `RunFolder.create` would find this run and its outcome. Writes nothing."""
+    try:
+        return RunFolder.open(Path(runs) / identity.folder_name).finished
+    except (BadInput, OSError):
+        return False
+
+
 class DamagedRecord(BadInput):
     """A run.json that is there and cannot be used."""
 

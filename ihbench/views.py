@@ -261,24 +261,8 @@ def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
 
     Raises `BadInput` when the capture has fewer frames or cameras than the protocol needs.
     """
-    training = protocol.training_frames(capture.name, capture.n_frames)
-    tested = protocol.test_views(capture.name, capture.n_frames, len(capture.camera_ids))
-    frames_needed = max([*training, *(frame for _, frame, _ in tested)], default=-1)
-    if not training:
-        raise BadInput(
-            f"{capture.dataset} {capture.name}: {protocol.name} selects no training frame of its {capture.n_frames}"
-        )
-    if frames_needed >= capture.n_frames:
-        raise BadInput(
-            f"{capture.dataset} {capture.name}: has {capture.n_frames} frames, {protocol.name} needs frame "
-            f"{frames_needed}; use a complete copy or another protocol"
-        )
     n_cameras = len(capture.camera_ids)
-    if protocol.train_camera >= n_cameras:
-        raise BadInput(
-            f"{capture.dataset} {capture.name}: has {n_cameras} cameras, "
-            f"training needs camera index {protocol.train_camera}"
-        )
+    protocol.check_views(capture.name, capture.n_frames, n_cameras, f"{capture.dataset} {capture.name}")
     hiding = apply_rule(protocol, capture)
     frames, covered = hiding.frames, hiding.covered
     lenses = {protocol.train_camera: Undistorter(capture.camera(protocol.train_camera), protocol.image)}
@@ -318,8 +302,6 @@ def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
         )
 
     keys = test_view_keys(protocol, capture.name, capture.n_frames, capture.camera_ids)
-    if not keys:
-        raise BadInput(f"{capture.dataset} {capture.name}: {protocol.name} leaves no test view ({n_cameras} cameras)")
 
     def test_view(k: int) -> TestView:
         key = keys[k]

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import tyro
 
 from ihbench import registry
-from ihbench.bounds import LARGEST_CAST, Within
+from ihbench.bounds import LARGEST_CAST, SEEDS, Within
 from ihbench.commands.parse import options
 from ihbench.errors import BadInput
 
@@ -40,7 +40,7 @@ class Standin:
     """Folder to write into; images that are already there are kept."""
     dataset: str = "zju_mocap"
     """Whose layout."""
-    seed: int = 0
+    seed: Annotated[int, SEEDS] = 0
     """Another seed is another cast: other bodies, clothes and motions."""
     subjects: Annotated[int, Within(1, LARGEST_CAST)] = 1
     """How many people."""

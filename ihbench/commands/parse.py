@@ -6,6 +6,7 @@ import io
 import re
 from collections.abc import Callable
 from contextlib import redirect_stderr
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -49,8 +50,21 @@ def options(kind: type[Options], argv: list[str], command: str, description: str
         if not end.code:
             raise
         raise BadInput(f"{_in_one_line(complaint.getvalue())}; see ihbench {command} --help") from end
+    _refuse_empty(chosen, argv)
     bounds.check(chosen)
     return chosen
+
+
+def _refuse_empty(chosen: Any, argv: list[str]) -> None:
+    """An option that takes several values and was given none (`--keep`, and no name) must not pass for one that was
+    left out."""
+    for word, following in pairwise([*argv, "--"]):
+        if word.startswith("--") and following.startswith("--"):
+            value = chosen
+            for name in word.removeprefix("--").replace("-", "_").split("."):
+                value = getattr(value, "config" if name == "method" and "." in word else name, None)
+            if value == ():
+                raise BadInput(f"{word}: expected one value or more, or leave it out")
 
 
 def _refuse_tyros_own(argv: list[str]) -> None:

@@ -59,6 +59,8 @@ def _planned(chosen: SceneChoice, protocol: Protocol) -> dict[str, Any]:
             report["scenes"][scene] = {"note": "stand-in not made yet: the run makes it; measured then"}
             continue
         capture, body = open_capture(protocol.dataset, source.root, scene, chosen.body)
+        where = f"{capture.dataset} {capture.name}"
+        protocol.check_views(capture.name, capture.n_frames, len(capture.camera_ids), where)
         try:
             measure = measure_scene(capture, protocol, body)
         except BadInput as error:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from ihbench import registry
-from ihbench.bounds import IMAGE_SIZES, Within
+from ihbench.bounds import IMAGE_SIZES, Within, refuse_repeated
 
 if TYPE_CHECKING:
     from ihbench.protocol import Protocol
@@ -42,7 +42,8 @@ class ProtocolChanges:
         if self.occlusion.rule is not None:
             registry.entry_point("occlusion", self.occlusion.rule)
         protocol = protocol.with_frames(self.train_frames, self.test_frames).with_size(self.image_size)
-        fractions = tuple(dict.fromkeys(self.occlusion.fraction)) or (None,)
+        refuse_repeated(self.occlusion.fraction, "--occlusion.fraction")
+        fractions = self.occlusion.fraction or (None,)
         return [protocol.with_occlusion(self.occlusion.rule, f, self.occlusion.covers) for f in fractions]
 
 

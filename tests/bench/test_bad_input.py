@@ -323,3 +323,95 @@ def test_an_avatar_that_is_too_large_for_the_disk(bench, finished, monkeypatch):
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert "avatar" in complaint(outcome)
     assert not any(name.endswith((".tmp", ".part")) for name in contents(bench.runs))
+
+
+# ------------------------------------------------------------------------- refused before a folder is made
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--train-frames 1000000:", "selects no training frame"),
+        ("--train-frames 0:100000000000:1", "needs frame 99999999999 (training)"),
+        ("--test-frames 0:1000:100", "needs frame 900 (test)"),
+        ("--test-frames 5000:6000:10", "needs frame 5990 (test)"),
+        ("--train-frames -5:10", "numbers from 0"),
+        ("--train-frames 0:10:0", "numbers from 0"),
+        ("--train-frames 10:5", "a stop above the start"),
+        ("--train-frames 0:0", "a stop above the start"),
+        ("--train-frames ٣:٩", "numbers from 0"),
+        ("--train-frames 0:1_0", "numbers from 0"),
+        ("--train-frames 5", "START:STOP:STEP"),
+        ("--seed 4294967296", "0 to 4294967295"),
+        ("--seed 9223372036854775808", "0 to 4294967295"),
+        ("--seed -1", "0 to 4294967295"),
+        ("--seed 0 1 0", "stands there twice"),
+        ("--seed", "expected"),
+        ("--keep", "expected one value or more"),
+        ("--scene standin-1 standin-1", "stands there twice"),
+        ("--occlusion.fraction 0.5 0.50", "stands there twice"),
+        ("--occlusion.fraction", "expected one value or more"),
+    ],
+)
+def test_no_folder_is_made_for_what_cannot_be(bench, mannequin, words, said):
+    line = complaint(bench.run(*words.split(), method=mannequin))
+    assert said in line
+    assert not bench.runs.exists()
+
+
+@pytest.mark.parametrize(
+    "train", ["{ start = 6000, stop = 7000, step = 1 }", "{ start = 900, stop = 'max_frames', step = 1 }"]
+)
+def test_a_protocol_file_with_frames_beyond_the_capture_makes_no_folder(bench, mannequin, tmp_path, train):
+    text = tiny_protocol(tmp_path / "mine.toml").read_text()
+    (tmp_path / "mine.toml").write_text(
+        text.replace("train = { frames = { step = 100 } }", f"train = {{ frames = {train} }}")
+    )
+    outcome = bench("run", "--protocol", tmp_path / "mine.toml", "--runs", bench.runs, "--method", mannequin)
+    assert "training" in complaint(outcome)
+    assert not bench.runs.exists()
+    for command in (("plan", "--method", mannequin), ("prepare", "--profile", "quick", "--out", tmp_path / "out")):
+        assert bench(*command, "--protocol", tmp_path / "mine.toml").status == 2
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_rule_that_does_not_fit_the_data_makes_no_folder(bench, mannequin, monkeypatch):
+    from ihbench import occlusion
+
+    def wrong(request):
+        raise occlusion.BadInput("the strip is wider than the image")
+
+    monkeypatch.setattr(
+        occlusion.registry,
+        "load",
+        lambda kind, name, load=occlusion.registry.load: wrong if kind == "occlusion" else load(kind, name),
+    )
+    assert "wider than the image" in complaint(bench.run(method=mannequin))
+    assert not bench.runs.exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--vary brightness=0.5:0.5", "stands there twice"),
+        ("--vary brightness=0.5:0.50", "stands there twice"),
+        ("--vary brightness=0.1 brightness=0.2", "stands there twice"),
+        ("--vary brightness=0.1:0.2 --set brightness=0.3", "leave one of the two out"),
+        ("--vary brightness=0.1:0.2 --set trouble-seed=1 trouble_seed=2", "stands there twice"),
+        ("--vary =1", "expected NAME=VALUE"),
+        ("--vary brightness=", "expected NAME=VALUE"),
+        ("--vary brightness=0.1:", "expected a number"),
+        ("--vary brightness=０.１:0.2", "expected a number"),
+        ("--vary", "expected one value or more"),
+        ("--vary brightness=0.1:0.2 --set", "expected one value or more"),
+        ("--vary brightness=0.1:0.2 --seed 1 1", "stands there twice"),
+        ("--vary brightness=0.1:0.2 --seed 99999999999", "0 to 4294967295"),
+        ("--vary brightness=0.1:0.2 --keep", "expected one value or more"),
+    ],
+)
+def test_a_grid_with_slips_runs_nothing(bench, mannequin, words, said):
+    line = complaint(
+        bench("ablate", "--protocol", bench.protocol, "--runs", bench.runs, "--method", mannequin, *words.split())
+    )
+    assert said in line
+    assert not bench.runs.exists()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from ihbench.bounds import STEPS, MultipleOf, Within, check
+from ihbench.bounds import SEEDS, STEPS, MultipleOf, Within, check
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class MiniTraining:
     """Of the networks' arithmetic; bfloat16 is for GPUs."""
     lr: Annotated[float, Within(0, 1, above=True)] = 5e-4
     """AdamW step size."""
-    seed: Annotated[int, Within(0, 2**32 - 1)] = 0
+    seed: Annotated[int, SEEDS] = 0
     """Draws the weights, the order and the masks."""
     average: Annotated[float, Within(0, 1)] = 0.999
     """Decay of the running mean of the weights, which is what is kept."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from ihbench.bounds import Within
+from ihbench.bounds import SEEDS, Within, refuse_repeated
 from ihbench.commands.device import check_device
 from ihbench.commands.scene_choice import ProtocolChanges
 from ihbench.errors import BadInput
@@ -30,7 +30,7 @@ class PaintOptions(ProtocolChanges):
     """Painters to compare."""
     frames: Annotated[int, Within(1, 100_000)] = 20
     """Training frames painted, evenly spread; personalisation sees all."""
-    seed: tuple[int, ...] = (0,)
+    seed: Annotated[tuple[int, ...], SEEDS] = (0,)
     """Seeds; their scores are averaged per scene before anything else."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where diffusion runs."""
@@ -69,6 +69,8 @@ def _paint(chosen: Any) -> int:
             raise BadInput(f"--rows {row}: {registry.nearest(row, list(ROWS))}")
     if not chosen.seed:
         raise BadInput("--seed: expected one number or more")
+    refuse_repeated(chosen.seed, "--seed")
+    refuse_repeated(chosen.rows, "--rows")
     protocols = chosen.apply(load_protocol(chosen.protocol, chosen.profile))
     if len(protocols) > 1:
         raise BadInput("--occlusion.fraction: one severity at a time")
