@@ -14,6 +14,7 @@ from typing import Any
 
 from ihbench.data_source import DataSource
 from ihbench.errors import BadInput
+from ihbench.gpu_slots import only
 from ihbench.interruption import GRACE, end_with_parent, interruptible, reason_of
 from ihbench.progress import Progress
 from ihbench.results import RunResult, read_result
@@ -46,10 +47,13 @@ class CellOutcome:
         return self.result is not None and self.result.status == "done"
 
 
-def run_cells(cells: Sequence[Cell], workers: int, threads: int, progress: Progress) -> list[CellOutcome]:
+def run_cells(
+    cells: Sequence[Cell], workers: int, threads: int, progress: Progress, cards: Sequence[int] | None = None
+) -> list[CellOutcome]:
     """Run all cells, `workers` at a time with `threads` threads each; outcomes in the order of the cells.
 
-    0 workers run them one after the other in this process. Interrupted, all processes end; the same call then finds
+    `cards` has the graphics card of each worker; a run sees no other. 0 workers run them one after the other in this
+    process, with the card that torch takes. Interrupted, all processes end; the same call then finds
     what is finished and goes on with what is not. Raises `ValueError` for a cell that waits for a later one.
     """
     for number, cell in enumerate(cells):
@@ -60,7 +64,7 @@ def run_cells(cells: Sequence[Cell], workers: int, threads: int, progress: Progr
 
         def ended(number: int, outcome: CellOutcome) -> None:
             outcomes[number] = outcome
-            status = outcome.problem or (outcome.result.status if outcome.result is not None else "")
+            status = outcome.problem or (outcome.result.outcome if outcome.result is not None else "")
             progress.say(f"{outcome.cell.name}: {status}")
             task.advance()
 
@@ -68,7 +72,7 @@ def run_cells(cells: Sequence[Cell], workers: int, threads: int, progress: Progr
             for number, cell in enumerate(cells):
                 ended(number, _in_this_process(cell))
         else:
-            _side_by_side(cells, workers, threads, ended)
+            _side_by_side(cells, workers, threads, ended, cards)
     return [outcomes[number] for number in range(len(cells))]
 
 
@@ -82,12 +86,18 @@ def _in_this_process(cell: Cell) -> CellOutcome:
 
 
 def _side_by_side(
-    cells: Sequence[Cell], workers: int, threads: int, ended: Callable[[int, CellOutcome], None]
+    cells: Sequence[Cell],
+    workers: int,
+    threads: int,
+    ended: Callable[[int, CellOutcome], None],
+    cards: Sequence[int] | None,
 ) -> None:
     context = get_context("spawn")  # torch's threads do not survive a fork
     waiting = list(range(len(cells)))
     finished: set[int] = set()
     running: dict[Connection, tuple[int, Any]] = {}
+    free_cards, card_of = list(cards or ()), {}
+    variables = {name: str(threads) for name in THREAD_VARIABLES}
     try:
         while waiting or running:
             ready = [n for n in waiting if (after := cells[n].after) is None or after in finished]
@@ -97,7 +107,9 @@ def _side_by_side(
                 cell = cells[number]
                 arguments = (theirs, cell.request, cell.source, cell.scene, threads)
                 process = context.Process(target=_child, args=arguments, daemon=True)
-                with _variables({name: str(threads) for name in THREAD_VARIABLES}):
+                if cards is not None:
+                    card_of[number] = free_cards.pop(0)
+                with _variables(variables | (only(card_of[number], os.environ) if cards is not None else {})):
                     process.start()
                 theirs.close()
                 running[ours] = number, process
@@ -105,6 +117,7 @@ def _side_by_side(
                 assert isinstance(connection, Connection)
                 number, process = running.pop(connection)
                 finished.add(number)
+                free_cards += [card_of.pop(number)] if cards is not None else []
                 ended(number, _outcome(cells[number], connection, process))
     finally:
         for _, process in running.values():

@@ -82,13 +82,14 @@ class Ledger:
         device: str = "cpu",
         state: Mapping[str, Any] | None = None,
         on_checkpoint: OnCheckpoint | None = None,
+        on_event: Callable[[str, Mapping[str, Any]], None] | None = None,  # kind and data of each, as it happens
         quality_times: QualityTimes = QualityTimes(),
         save_every: float = 20.0,  # s, the least time between two saved states
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         self.folder = None if folder is None else Path(folder)
         self.device = device
-        self.on_checkpoint = on_checkpoint
+        self.on_checkpoint, self.on_event = on_checkpoint, on_event
         self.quality_times = quality_times
         self.save_every = save_every
         self.events: list[dict[str, Any]] = []
@@ -312,6 +313,8 @@ class Ledger:
     def event(self, kind: str, **data: Any) -> None:
         """Note something that happened: "warning", "diverged", "resumed", ..., with both clocks."""
         self.events.append({"kind": kind, "fit_seconds": self.fit_seconds, "seconds": self.seconds, "data": data})
+        if self.on_event is not None:
+            self.on_event(kind, data)
 
     def state(self) -> dict[str, Any]:
         """Everything but the checkpoints, as JSON-able data, for the run record and for `Ledger(state=...)`."""

@@ -15,11 +15,9 @@ from ihbench.interruption import interruptible, reason_of, undisturbed
 from ihbench.ledger import Ledger, OnCheckpoint
 from ihbench.progress import Progress
 from ihbench.protocol import Protocol
-from ihbench.results import RunResult, read_result
+from ihbench.results import TRACEBACK, RunResult, read_result
 from ihbench.scene import Capture
 from ihbench.store import RunFolder, RunIdentity
-
-TRACEBACK = "traceback.txt"  # of a run that failed, in its folder
 
 
 class RecordedRun(ABC):
@@ -34,8 +32,12 @@ class RecordedRun(ABC):
     ):
         self.folder, self.progress = folder, progress
         before = folder.record["ledger"]
-        self.ledger = Ledger(folder.path, device=device, state=before, on_checkpoint=on_checkpoint)
+        self.ledger = Ledger(
+            folder.path, device=device, state=before, on_checkpoint=on_checkpoint, on_event=self._say_where
+        )
         if before is not None:
+            if not any(folder.checkpoints.glob("*.safetensors")):
+                progress.say("beginning again: the earlier process saved nothing of this run")
             folder.restarted()
             removal.discard_file(folder.path / TRACEBACK)
 
@@ -69,6 +71,11 @@ class RecordedRun(ABC):
                 self.folder.set_status(status, reason, self.ledger)
             except (BadInput, OSError) as error:  # the disk that failed the run may fail its record too
                 self.progress.say(f"the run's record could not be written: {error}")
+
+    def _say_where(self, kind: str, data: Mapping[str, Any]) -> None:
+        """Where a run goes on that was cut short, or begins with what another one lent."""
+        if kind == "resumed":
+            self.progress.say(f"continuing {data.get('stage', 'the fit')} at step {data.get('step', 'unknown')}")
 
     def describe(self, **more: Any) -> None:
         """Put the clocks, the peak memory, what the machine has turned out to be, and more into the record."""

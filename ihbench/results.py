@@ -18,6 +18,7 @@ from ihbench.store import RunFolder
 if TYPE_CHECKING:
     from ihbench.scoring import ViewScores
 
+TRACEBACK = "traceback.txt"  # of a run that failed, in its folder
 Rows = dict[str, dict[str, Mean]]  # row name -> identity -> mean over the scene's test views
 
 
@@ -35,6 +36,12 @@ class RunResult:
     @property
     def status(self) -> str:
         return self.record["status"]
+
+    @property
+    def outcome(self) -> str:
+        """The status, and why where it is not done, with the path of the traceback where there is one."""
+        reason = self.record["reason"].replace(f"(see {TRACEBACK})", f"(see {self.folder / TRACEBACK})")
+        return f"{self.status}: {reason}" if reason else self.status
 
     @property
     def identity(self) -> dict[str, Any]:

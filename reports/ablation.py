@@ -296,4 +296,4 @@ def _plain(value: Any) -> Any:
 def _failure(outcome: CellOutcome) -> str:
     if outcome.result is None:
         return f"{outcome.cell.name}: {outcome.problem}"
-    return f"{outcome.cell.name}: {outcome.result.status} ({outcome.result.record['reason']})"
+    return f"{outcome.cell.name}: {outcome.result.outcome}"

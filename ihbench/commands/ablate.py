@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, make_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -10,16 +11,18 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from ihbench import registry
-from ihbench.bounds import Within
+from ihbench.bounds import SEEDS, Within, refuse_repeated
 from ihbench.commands.device import check_device
 from ihbench.commands.keep import check_keep
 from ihbench.commands.parse import options
 from ihbench.commands.scene_choice import SceneChoice
 from ihbench.errors import BadInput
+from ihbench.gpu_slots import card_slots, free_memory
 
 if TYPE_CHECKING:
     from ihbench.ablation import Ladder
-    from ihbench.cells import Cell
+    from ihbench.cells import Cell, CellOutcome
+    from ihbench.progress import Progress
 
 BETWEEN = ":"  # values of one switch
 
@@ -35,12 +38,13 @@ class AblateOptions(SceneChoice):
     keep: tuple[str, ...] = ()
     """Fields that the plan must not change (`ihbench plan` lists them), or all. Fields that the rungs set are kept
     anyway: what is compared is what was asked for."""
-    seed: tuple[int, ...] = (0, 1, 2)
+    seed: Annotated[tuple[int, ...], SEEDS] = (0, 1, 2)
     """Seeds; their scores are averaged per scene before anything is compared."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to fit."""
     workers: Annotated[int | None, Within(0, 1024)] = None
-    """Runs at a time, each in a process of its own; by default one per core. 0 runs them in this process."""
+    """Runs at a time, each in a process of its own; by default one per core, on a GPU as many as its
+    memory has room for. 0 runs them in this process."""
     share: bool = True
     """Let rungs that begin alike share what they begin with; its seconds count in each of them."""
     out: Path | None = None
@@ -53,33 +57,68 @@ def main(argv: list[str]) -> int:
 
 
 def _ablate(chosen: AblateOptions) -> int:
-    from ihbench import outputs
-    from ihbench.cells import run_cells
-    from ihbench.machine import usable_cores
     from ihbench.progress import Progress
 
     if chosen.ladder == "list":
         for name, found in _ladders(chosen.method).items():
             print(f"{name:<12}{len(found.rungs)} rungs: {found.title}")
         return 0
-    if not chosen.seed or min(chosen.seed) < 0:
-        raise BadInput(f"--seed {' '.join(map(str, chosen.seed))}: expected one number or more, each 0 or above")
+    config = profile_of(chosen)
+    vary = {
+        name: [_value(chosen, config, name, text) for text in texts.split(BETWEEN)]
+        for name, texts in _named(chosen.vary, "--vary").items()
+    }
+    switches = {name: _value(chosen, config, name, text) for name, text in _named(chosen.set, "--set").items()}
+    text, numbers, outcomes = ablated(chosen, vary, switches, Progress())
+    print(json.dumps(numbers, allow_nan=False) if chosen.json else text)
+    write_out(chosen, text, numbers)
+    return 0 if all(outcome.done for outcome in outcomes) else 1
+
+
+def ablated(
+    chosen: AblateOptions, vary: Mapping[str, Sequence[Any]], switches: Mapping[str, Any], progress: Progress
+) -> tuple[str, dict[str, Any], list[CellOutcome]]:
+    """Do the runs of a ladder, or of the grid `vary`, with `switches` on every rung: the table as Markdown and as
+    numbers, and how each run ended. The options' own words for both are not read. Raises `BadInput`."""
+    from ihbench import outputs
+    from ihbench.cells import run_cells
+    from ihbench.machine import usable_cores
+
+    if not chosen.seed:
+        raise BadInput("--seed: expected one number or more")
+    refuse_repeated(chosen.seed, "--seed")
+    registry.entry_point("table", "ablation")  # before anything is fitted: another package may claim the name
     check_device(chosen.device)
     if chosen.out is not None:
         outputs.check(chosen.out, ["ablation.md", "ablation.json"])
-    progress = Progress()
-    ladder = _ladder(chosen)
+    ladder = _ladder(chosen, vary, switches)
     cells = _cells(chosen, ladder, progress)
-    workers = usable_cores() if chosen.workers is None else chosen.workers
-    threads = max(usable_cores() // max(min(workers, len(cells)), 1), 1)
-    outcomes = run_cells([cell for _, cell in cells], workers, threads, progress)
+    cores, cards = usable_cores(), None
+    workers = cores if chosen.workers is None else chosen.workers
+    if chosen.device == "cuda" and workers:
+        cards = card_slots(free_memory(), len(cells), cores, chosen.workers)
+        workers = len(cards)
+    threads = max(cores // max(min(workers, len(cells)), 1), 1)
+    outcomes = run_cells([cell for _, cell in cells], workers, threads, progress, cards)
     rungs = [rung for rung, _ in cells]
     text, numbers = registry.load("table", "ablation")(ladder, list(zip(rungs, outcomes, strict=True)))
-    print(json.dumps(numbers, allow_nan=False) if chosen.json else text)
+    return text, numbers, outcomes
+
+
+def write_out(chosen: AblateOptions, text: str, numbers: dict[str, Any]) -> None:
+    """Write the table into the folder that was asked for, if one was."""
+    from ihbench import outputs
+
     if chosen.out is not None:
         outputs.write_text(chosen.out / "ablation.md", text)
         outputs.write_json(chosen.out / "ablation.json", numbers)
-    return 0 if all(outcome.done for outcome in outcomes) else 1
+
+
+def profile_of(chosen: AblateOptions) -> Any:
+    """The method's configuration under the profile. Raises `BadInput`."""
+    from ihbench.run_loop import configuration
+
+    return configuration(chosen.method, chosen.profile, {})
 
 
 def _ladders(method: str) -> dict[str, Ladder]:
@@ -87,18 +126,13 @@ def _ladders(method: str) -> dict[str, Ladder]:
     return registry.load("ladder", method) if method in registry.names("ladder") else {}
 
 
-def _ladder(chosen: AblateOptions) -> Ladder:
+def _ladder(chosen: AblateOptions, vary: Mapping[str, Sequence[Any]], switches: Mapping[str, Any]) -> Ladder:
     from ihbench.ablation import grid, set_on_all
-    from ihbench.run_loop import configuration
 
-    config = configuration(chosen.method, chosen.profile, {})
-    if chosen.vary:
+    config = profile_of(chosen)
+    if vary:
         if chosen.ladder:
             raise BadInput(f"--ladder {chosen.ladder} with --vary: expected one of the two")
-        vary: dict[str, list[Any]] = {}
-        for word in chosen.vary:
-            name, texts = _split(word, "--vary")
-            vary[name] = [_value(chosen, config, name, text) for text in texts.split(BETWEEN)]
         ladder = grid(config, vary)
     else:
         known = _ladders(chosen.method)
@@ -110,18 +144,21 @@ def _ladder(chosen: AblateOptions) -> Ladder:
         if name not in known:
             raise BadInput(f"--ladder {name}: {registry.nearest(name, list(known))}")
         ladder = known[name]
-    switches = {}
-    for word in chosen.set:
-        name, text = _split(word, "--set")
-        switches[name] = _value(chosen, config, name, text)
+    for name in switches:
+        if name in vary:
+            raise BadInput(f"--set {name}={switches[name]}: --vary gives it its values; leave one of the two out")
     return set_on_all(ladder, switches)
 
 
-def _split(word: str, flag: str) -> tuple[str, str]:
-    name, equals, text = word.partition("=")
-    if not equals or not name:
-        raise BadInput(f"{flag} {word}: expected NAME=VALUE")
-    return name.removeprefix("method.").replace("-", "_"), text
+def _named(words: Sequence[str], flag: str) -> dict[str, str]:
+    """Name -> text of several NAME=TEXT. Raises `BadInput` for another form, and for a name given twice."""
+    found = [word.partition("=") for word in words]
+    for word, (name, _, text) in zip(words, found, strict=True):
+        if not name or not text:
+            raise BadInput(f"{flag} {word}: expected NAME=VALUE")
+    names = [name.removeprefix("method.").replace("-", "_") for name, _, _ in found]
+    refuse_repeated(names, flag)
+    return dict(zip(names, (text for _, _, text in found), strict=True))
 
 
 def _value(chosen: AblateOptions, config: Any, name: str, text: str) -> Any:
@@ -149,21 +186,25 @@ def _cells(chosen: AblateOptions, ladder: Ladder, progress: Any) -> list[tuple[s
     from ihbench.cells import Cell
     from ihbench.data_source import locate
     from ihbench.protocol import load_protocol
-    from ihbench.run_loop import RunRequest, configuration
+    from ihbench.run_loop import RunRequest
 
-    config = configuration(chosen.method, chosen.profile, {})
-    if chosen.keep and "all" not in chosen.keep:
-        check_keep(chosen.keep, config)
+    config = profile_of(chosen)
+    check_keep(chosen.keep, config)
     shared = getattr(registry.load("config", chosen.method), "SHARED_STATES", {}) if chosen.share else {}
     cells: list[tuple[str, Cell]] = []
     for protocol in chosen.apply(load_protocol(chosen.protocol, chosen.profile)):
         source = locate(protocol, chosen.data, chosen.scene)
+        refused = []
         for scene in source.scenes:
             try:
                 source.open(scene, chosen.body, progress)  # makes a stand-in once, before many want it
             except BadInput as error:  # its cells will say so again; the other scenes go on
-                progress.say(f"{scene}: {error}")
-        for seed in dict.fromkeys(chosen.seed):
+                refused.append((scene, error))
+        if len(refused) == len(source.scenes):
+            raise refused[0][1]
+        for scene, error in refused:
+            progress.say(f"{scene}: {error}")
+        for seed in chosen.seed:
             for scene in source.scenes:
                 first: dict[Any, int] = {}
                 for rung in ladder.rungs:

@@ -48,7 +48,9 @@ sys.exit(main(sys.argv[1:]))
 
 
 def assert_continues_to_the_same_numbers(bench, finished, step):
-    assert bench.run().status == 0
+    outcome = bench.run()
+    assert outcome.status == 0
+    assert f"continuing stage1 at step {step}" in outcome.err
     (folder,) = bench.folders()
     assert record(bench)["status"] == "done"
     assert [event["step"] for event in events(bench, "resumed")] == [step]
@@ -194,6 +196,7 @@ def test_a_method_that_raises_fails_with_its_reason_and_the_other_runs_go_on(ben
     assert f"Not done: mannequin on standin-1: failed ({why['reason']})." in outcome.out
     assert read_json(done / "run.json")["status"] == "done"
     assert "Traceback" not in outcome.err
+    assert f"(see {failed / 'traceback.txt'})" in outcome.out.splitlines()[-2]
 
 
 def test_a_failed_run_is_tried_again(bench, mannequin, monkeypatch):
