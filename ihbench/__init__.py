@@ -8,19 +8,19 @@ from ihbench.kernel_cache import choose_kernel_cache
 from ihbench.threads import bound_spinning
 
 __version__ = "0.2.0"
-__all__ = ["load_scene", "run"]
+__all__ = ["ablate", "load_scene", "run", "score"]
 
 choose_kernel_cache()  # before numba
 bound_spinning()  # whoever comes in, by whichever module, comes by here, and mostly before torch
 
 if TYPE_CHECKING:
-    from ihbench.run_loop import load_scene, run
+    from ihbench.api import ablate, load_scene, run, score
 
 
 def __getattr__(name: str) -> Any:
-    """`ihbench.run` and `ihbench.load_scene`, imported at first use."""
+    """`ihbench.run` and its like, imported at first use."""
     if name in __all__:
-        from ihbench import run_loop
+        from ihbench import api
 
-        return getattr(run_loop, name)
+        return getattr(api, name)
     raise AttributeError(f"module 'ihbench' has no attribute {name!r}")

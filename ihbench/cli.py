@@ -11,6 +11,7 @@ from ihbench import __version__, registry, streams
 from ihbench.errors import BadInput
 from ihbench.failures import Failure, explained, one_line
 from ihbench.interruption import interruptible
+from ihbench.provenance import description, note_command
 
 COMMANDS = {
     "run": "fit a method under a protocol, score it, print the table (the main job)",
@@ -38,7 +39,8 @@ def usage() -> str:
         "",
     ]
     lines += [f"  {name:<11}{what}" for name, what in COMMANDS.items()]
-    lines += [f"  {name:<11}{_summary(name)}" for name in registry.names("command")]
+    added = [name for name in registry.names("command") if name not in COMMANDS]
+    lines += [f"  {name:<11}{_summary(name)}" for name in added]
     lines += [
         "",
         "start here: ihbench run --protocol zju_occ --scene standin-1",
@@ -89,8 +91,9 @@ def _run(argv: list[str]) -> int:
         print(usage())
         return 0
     if argv[0] in ("-V", "--version"):
-        print(__version__)
+        print(description())
         return 0
+    note_command(argv)
     if argv[0] in COMMANDS:
         return import_module(f"ihbench.commands.{argv[0]}").main(argv[1:])
     added = registry.names("command")  # by methods and by other packages

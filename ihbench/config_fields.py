@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
+from ihbench.bounds import check
+
 
 def flat(config: Any) -> dict[str, Any]:
     """Name -> value; the fields of a nested dataclass come as "outer.inner"."""
@@ -20,12 +22,19 @@ def flat(config: Any) -> dict[str, Any]:
 
 
 def with_fields(config: Any, values: Mapping[str, Any]) -> Any:
-    """The configuration with some fields, named as `flat` names them, replaced. Raises `TypeError` for others."""
+    """The configuration with some fields, named as `flat` names them, replaced. Raises `TypeError` for others, and
+    `BadInput` for values of another type or out of bounds."""
+    changed = _replaced(config, values)
+    check(changed, "--method.")
+    return changed
+
+
+def _replaced(config: Any, values: Mapping[str, Any]) -> Any:
     own: dict[str, Any] = {name: value for name, value in values.items() if "." not in name}
     for outer in dict.fromkeys(name.partition(".")[0] for name in values if "." in name):
         inner = {name.partition(".")[2]: value for name, value in values.items() if name.startswith(outer + ".")}
         nested = getattr(config, outer, None)
         if not is_dataclass(nested) or isinstance(nested, type):
             raise TypeError(f"no field {outer!r} with fields of its own")
-        own[outer] = with_fields(nested, inner)
+        own[outer] = _replaced(nested, inner)
     return replace(config, **own)

@@ -2,23 +2,36 @@
 
 from __future__ import annotations
 
+import os
+import platform
 import subprocess
+from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import ihbench
+from ihbench import registry
 
 PACKAGES = (
     "numpy",
     "scipy",
     "torch",
+    "torchvision",
     "opencv-contrib-python-headless",
+    "pillow",
+    "h5py",
     "numba",
+    "lpips",
     "safetensors",
     "gsplat",
     "diffusers",
+    "transformers",
+    "peft",
+    "accelerate",
 )
+
+_words: list[str] = []  # of the command that this process was started for; none from Python
 
 
 def provenance() -> dict[str, Any]:
@@ -27,14 +40,39 @@ def provenance() -> dict[str, Any]:
 
 
 def package_versions() -> dict[str, str]:
-    """Installed versions of the packages that can move a number; a package that is not there is left out."""
+    """Installed versions of the packages that can move a number, and of those that register something with the bench;
+    a package that is not there is left out."""
     versions = {}
-    for name in PACKAGES:
+    for name in (*PACKAGES, *sorted({*registry.other_packages().values()} - {*PACKAGES})):
         try:
             versions[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             continue
     return versions
+
+
+def note_command(argv: Sequence[str]) -> None:
+    """Keep the words of the command line for the records of its runs."""
+    _words[:] = argv
+
+
+def command() -> tuple[str, ...]:
+    """The words of the command line, without folders: run folders are shared. None when called from Python."""
+    return tuple(map(_without_folders, _words))
+
+
+def _without_folders(word: str) -> str:
+    flag, equals, value = word.partition("=") if word.startswith("--") else ("", "", word)
+    folder, name = os.path.split(value.rstrip(os.sep))
+    return f"{flag}{equals}…/{name}" if folder else word
+
+
+def description() -> str:
+    """What `ihbench --version` says: the version, the commit, and what computes."""
+    git, packages = git_state(), package_versions()
+    commit = "" if git is None else f", commit {git['commit'][:10]}{' with changes' if git['dirty'] else ''}"
+    computing = ", ".join(f"{name} {packages[name]}" for name in ("torch", "numpy", "numba") if name in packages)
+    return f"{ihbench.__version__}{commit} (Python {platform.python_version()}, {computing})"
 
 
 def git_state(folder: Path | None = None) -> dict[str, Any] | None:

@@ -108,6 +108,7 @@ class About(TypedDict):
     headline: NotRequired[Words]
     protocol: NotRequired[ProtocolContent]
     device: NotRequired[str]
+    command: NotRequired[list[str]]
     provenance: NotRequired[str]
     predictions: NotRequired[PredictionFiles]
     changed: NotRequired[list[str]]

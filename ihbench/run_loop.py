@@ -8,25 +8,28 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
+from dataclasses import field as dataclass_field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench import machine, registry
+from ihbench import bounds, machine, registry
+from ihbench.bounds import SEEDS
 from ihbench.capture_digest import capture_digest
 from ihbench.config_fields import flat, with_fields
 from ihbench.curve_views import curve_views
-from ihbench.data_source import DataSource, locate
+from ihbench.data_source import DataSource
 from ihbench.errors import BadInput
 from ihbench.metrics import mean_over_frames
 from ihbench.plan import Omission, SceneMeasure, absent_regions, measure_scene
 from ihbench.progress import Progress
-from ihbench.protocol import Protocol, load_protocol
+from ihbench.protocol import Protocol
+from ihbench.provenance import command
 from ihbench.recorded_run import RecordedRun, about_scene, recorded
 from ihbench.reopen import reopen_body, reopen_capture
 from ihbench.results import RunResult
@@ -34,7 +37,7 @@ from ihbench.scene import Avatar, Capture, Method, TestView, TrainingSet
 from ihbench.score_stage import ScoreStage
 from ihbench.scoring import Scorer
 from ihbench.source_digest import code_of, shipped_digest
-from ihbench.store import RunFolder, RunIdentity
+from ihbench.store import RunFolder, RunIdentity, is_finished
 from ihbench.views import OccludedScene, open_scene
 
 if TYPE_CHECKING:
@@ -50,57 +53,17 @@ class RunRequest:
     protocol: Protocol
     method: str
     config: Any  # the method's frozen configuration dataclass
-    seed: int = 0
+    seed: Annotated[int, SEEDS] = 0
     device: str = "cpu"
     runs: Path = Path("runs")
     body: Path | None = None  # SMPL model file, for real data
     force: bool = False  # do it again even if it is done
     keep: tuple[str, ...] = ()  # fields that the plan must not change; "all" for none
     share: bool = False  # take saved states from other runs where they would come out the same
+    command: tuple[str, ...] = dataclass_field(default_factory=command)  # for the record only
 
-
-def run(
-    protocol: str = "zju_occ",
-    scene: str = "standin-1",
-    *,
-    method: str = "inpainthuman",
-    profile: str = "quick",
-    data: Path | str | None = None,
-    runs: Path | str = "runs",
-    body: Path | str | None = None,
-    seed: int = 0,
-    device: str = "cpu",
-    force: bool = False,
-    progress: Progress | None = None,
-    **switches: Any,
-) -> RunResult:
-    """Run one method on one scene, as `ihbench run` does; `switches` are fields of the method's configuration.
-
-    Raises `BadInput` for anything the caller got wrong. Divergence and failure are statuses of the result.
-    """
-    chosen = load_protocol(protocol, profile)
-    config = configuration(method, profile, switches)
-    request = RunRequest(
-        chosen, method, config, seed, device, Path(runs), None if body is None else Path(body), force
-    )
-    source = locate(chosen, None if data is None else Path(data), (scene,))
-    return run_scene(request, source, scene, progress or Progress())
-
-
-def load_scene(
-    protocol: str = "zju_occ",
-    scene: str = "standin-1",
-    *,
-    profile: str = "quick",
-    data: Path | str | None = None,
-    body: Path | str | None = None,
-    progress: Progress | None = None,
-) -> tuple[OccludedScene, Body]:
-    """Training and test views of one scene under a protocol, loaded lazily, and the body model of its poses."""
-    chosen = load_protocol(protocol, profile)
-    source = locate(chosen, None if data is None else Path(data), (scene,))
-    capture, model = source.open(scene, None if body is None else Path(body), progress or Progress())
-    return open_scene(capture, chosen), model
+    def __post_init__(self) -> None:
+        bounds.check(self, "", ("seed", "device", "runs", "force", "keep", "share"))
 
 
 def configuration(method: str, profile: str, switches: dict[str, Any]) -> Any:
@@ -119,18 +82,38 @@ def configuration(method: str, profile: str, switches: dict[str, Any]) -> Any:
 
 def run_scene(request: RunRequest, source: DataSource, scene: str, progress: Progress) -> RunResult:
     """Run on one scene, or find the finished run."""
-    began = time.perf_counter(), time.process_time()
+    clock = _Clock()
     capture, body = source.open(scene, request.body, progress)
     identity = run_identity(request, capture, body)
-    about = about_scene(capture, request.protocol) | {"device": request.device}
-    opened = time.perf_counter() - began[0], time.process_time() - began[1]
+    about = about_scene(capture, request.protocol) | {
+        "device": request.device,
+        "command": list(request.command),
+    }
+    before = {"open": clock.lap()}
+    occluded = None
+    if request.force or not is_finished(request.runs, identity):
+        occluded = open_scene(capture, request.protocol)  # what does not fit is refused before a folder is made
+        before["occlude"] = clock.lap()
     return recorded(
         request.runs,
         identity,
         about,
         request.force,
-        lambda folder: _Run(request, capture, body, folder, progress, opened),
+        lambda folder: _Run(
+            request, occluded or open_scene(capture, request.protocol), body, folder, progress, before
+        ),
     )
+
+
+class _Clock:
+    """Seconds since it was last asked, wall and CPU."""
+
+    def __init__(self) -> None:
+        self._last = time.perf_counter(), time.process_time()
+
+    def lap(self) -> tuple[float, float]:
+        last, self._last = self._last, (time.perf_counter(), time.process_time())
+        return self._last[0] - last[0], self._last[1] - last[1]
 
 
 def run_identity(request: RunRequest, capture: Capture, body: Body) -> RunIdentity:
@@ -168,24 +151,23 @@ class _Run(RecordedRun):
     def __init__(
         self,
         request: RunRequest,
-        capture: Capture,
+        scene: OccludedScene,
         body: Body,
         folder: RunFolder,
         progress: Progress,
-        opened: tuple[float, float] = (0.0, 0.0),  # s, wall and CPU, that opening the scene took
+        before: Mapping[str, tuple[float, float]],  # s, wall and CPU, that opening the scene took
     ):
         super().__init__(folder, progress, request.device, self._curve_point)
-        self.ledger.book("open", *opened)
-        self.request, self.capture, self.body = request, capture, body
+        for stage, clocks in before.items():
+            self.ledger.book(stage, *clocks)
+        self.request, self.occluded, self.capture, self.body = request, scene, scene.capture, body
         self.scorer: Scorer | None = None
 
     def work(self) -> None:
         with self.ledger.stage("import"):
             from ihbench.render.splat import warm_up  # brings torch, which `ihbench plan` must not load
 
-        request, protocol = self.request, self.request.protocol
-        with self.ledger.stage("occlude"):
-            scene = open_scene(self.capture, protocol)
+        request, protocol, scene = self.request, self.request.protocol, self.occluded
         with scene.train.preload() as preloading:  # beside planning and compiling
             with self.ledger.stage("plan"):
                 measure = measure_scene(self.capture, protocol, self.body)

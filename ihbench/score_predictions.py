@@ -14,6 +14,7 @@ from ihbench.predictions import Predictions, find_alpha, find_predictions
 from ihbench.prepared import Prepared
 from ihbench.progress import Progress
 from ihbench.protocol import Protocol
+from ihbench.provenance import command
 from ihbench.recorded_run import RecordedRun, about_scene, recorded
 from ihbench.results import RunResult, read_result
 from ihbench.score_stage import ScoreStage
@@ -67,6 +68,7 @@ def score_scene(request: ScoreRequest, source: DataSource, scene: str, progress:
     )
     about = about_scene(capture, request.protocol) | {
         "device": "cpu",
+        "command": list(command()),
         "provenance": MADE_ELSEWHERE,
         "predictions": {
             "folder": request.folder.resolve().name,

@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field, make_dataclass
-from typing import Annotated, Any, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from ihbench import registry
+from ihbench.bounds import SEEDS, refuse_repeated
 from ihbench.commands.device import check_device
 from ihbench.commands.keep import check_keep
 from ihbench.commands.parse import options
 from ihbench.commands.scene_choice import SceneChoice
 from ihbench.errors import BadInput
 
+if TYPE_CHECKING:
+    from ihbench.results import RunResult
+
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(SceneChoice):
-    seed: tuple[int, ...] = (0,)
+    seed: Annotated[tuple[int, ...], SEEDS] = (0,)
     """Seeds; each is a run of its own."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to fit."""
@@ -26,9 +31,32 @@ class RunOptions(SceneChoice):
     """Switches that the plan must not change for this scene; "all" keeps everything."""
     force: bool = False
     """Run again even if the same run is done."""
+    like: Path | None = None
+    """Repeat the run in this folder, from its record: protocol, method, switches, scene and seed are its own. Beside
+    it only --data, --body, --runs, --device, --force and --json."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LikeOptions:
+    like: Path
+    """The folder of the run to repeat."""
+    data: Path | None = None
+    """Your copy of the data set, if the run used one (or IHBENCH_DATA)."""
+    body: Path | None = None
+    """SMPL model file for real data (or IHBENCH_BODY)."""
+    runs: Path = Path("runs")
+    """Where run folders lie."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where to fit."""
+    force: bool = False
+    """Run again even if the same run is done."""
+    json: bool = False
+    """Print one JSON object on stdout and nothing else there."""
 
 
 def main(argv: list[str]) -> int:
+    if _peek(argv, "--like", ""):
+        return _repeat(options(LikeOptions, argv, "run", "Repeat a run from its record."))
     method, profile = _peek(argv, "--method", "inpainthuman"), _peek(argv, "--profile", "quick")
     chosen = options(_with_switches(method, profile), argv, "run", "Fit a method under a protocol and score it.")
     return _run(chosen)
@@ -59,19 +87,19 @@ def _with_switches(method: str, profile: str) -> type[RunOptions]:
 
 def _run(chosen: Any) -> int:
     check_device(chosen.device)
+    registry.entry_point("report", "md")  # before anything is fitted: another package may claim the name
     from dataclasses import replace
 
     from ihbench.data_source import locate
     from ihbench.progress import Progress
     from ihbench.protocol import load_protocol
-    from ihbench.results import as_json
     from ihbench.run_loop import RunRequest, run_scene
 
     protocols = chosen.apply(load_protocol(chosen.protocol, chosen.profile))
-    if chosen.keep and "all" not in chosen.keep:
-        check_keep(chosen.keep, chosen.config)
-    if not chosen.seed or min(chosen.seed) < 0:
-        raise BadInput(f"--seed {' '.join(map(str, chosen.seed))}: expected one number or more, each 0 or above")
+    check_keep(chosen.keep, chosen.config)
+    if not chosen.seed:
+        raise BadInput("--seed: expected one number or more")
+    refuse_repeated(chosen.seed, "--seed")
     progress = Progress()
     results = []
     for protocol in protocols:
@@ -81,16 +109,39 @@ def _run(chosen: Any) -> int:
             chosen.keep,
         )  # fmt: skip
         for scene in source.scenes:
-            for seed in dict.fromkeys(chosen.seed):
+            for seed in chosen.seed:
                 progress.say(f"{protocol.name} {scene}: {chosen.method}, {chosen.profile} profile, seed {seed}")
                 results.append(run_scene(replace(request, seed=seed), source, scene, progress))
+    return _print(results, chosen.json)
+
+
+def _repeat(chosen: LikeOptions) -> int:
+    check_device(chosen.device)
+    registry.entry_point("report", "md")
+    from ihbench.data_source import locate
+    from ihbench.progress import Progress
+    from ihbench.repeat import differences, repetition
+    from ihbench.run_loop import run_scene
+
+    progress = Progress()
+    again = repetition(chosen.like, chosen.runs, chosen.body, chosen.device, chosen.force)
+    request, scene = again.request, again.scene
+    progress.say(f"{request.protocol.name} {scene}: {request.method} as in {chosen.like}, seed {request.seed}")
+    result = run_scene(request, locate(request.protocol, chosen.data, (scene,)), scene, progress)
+    for line in differences(chosen.like, result):
+        progress.say(f"repeated: {line}")
+    return _print([result], chosen.json)
+
+
+def _print(results: list[RunResult], as_one_object: bool) -> int:
+    from ihbench.results import as_json
+
     text = registry.load("report", "md")(results)
-    if chosen.json:
+    if as_one_object:
         print(json.dumps(as_json(results), allow_nan=False))
     else:
         print(text)
         for result in results:
-            print(
-                f"{result.scene}: {result.folder / 'contact_sheet.png' if result.status == 'done' else result.folder}"
-            )
+            done = result.status == "done"
+            print(f"{result.scene}: {result.folder / 'contact_sheet.png' if done else result.outcome}")
     return 0 if all(result.status == "done" for result in results) else 1

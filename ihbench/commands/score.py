@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
     from ihbench.data_source import DataSource
     from ihbench.prepared import Prepared
+    from ihbench.progress import Progress
+    from ihbench.results import RunResult
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,35 +57,13 @@ class ScoreOptions(ProtocolChanges):
 
 def main(argv: list[str]) -> int:
     chosen = options(ScoreOptions, argv, "score", "Score images that somebody else's code rendered.")
-    from ihbench.calibration import ROWS
     from ihbench.progress import Progress
     from ihbench.results import as_json
-    from ihbench.score_predictions import ScoreRequest, score_scene
 
-    source, prepared = _source(chosen)
     if chosen.names:
-        return _print_names(chosen, source)
-    name = chosen.name or chosen.predictions.resolve().name
-    if name in ROWS or not name.strip():
-        raise BadInput(f"--name {name!r}: is a calibration row's name; choose another with --name")
-    progress, protocol = Progress(), source.protocol
-    body = chosen.body or (prepared.body_file if prepared is not None else None)
-    request = ScoreRequest(
-        protocol, chosen.predictions, name, chosen.pattern, chosen.runs, body, chosen.force, chosen.alpha, prepared
-    )
-    results = []
-    for scene in chosen.scene or _with_folders(source.scenes, chosen.predictions, chosen.pattern):
-        progress.say(f"{protocol.name} {scene}: predictions {name}, {protocol.profile} profile")
-        results.append(score_scene(request, source, scene, progress))
-    complete = True
-    for result in results:
-        found = result.record["about"]["predictions"]
-        complete &= not found["missing"]
-        for kind in ("missing", "surplus"):
-            for path in found[kind]:
-                progress.say(f"{result.scene}: {kind}: {path}")
-        for note in [*found["notes"], *found["doubts"]]:
-            progress.say(f"{result.scene}: {note}")
+        return _print_names(chosen, _source(chosen)[0])
+    results = scored(chosen, Progress())
+    complete = all(not result.record["about"]["predictions"]["missing"] for result in results)
     if chosen.json:
         told = as_json(results)
         for run, result in zip(told["runs"], results, strict=True):
@@ -92,6 +72,34 @@ def main(argv: list[str]) -> int:
     else:
         print(registry.load("report", "md")(results))
     return 0 if complete and all(result.status == "done" for result in results) else 1
+
+
+def scored(chosen: ScoreOptions, progress: Progress) -> list[RunResult]:
+    """Score what the options name: a result for each scene. Says what is missing or doubtful. Raises `BadInput`."""
+    from ihbench.calibration import ROWS
+    from ihbench.score_predictions import ScoreRequest, score_scene
+
+    source, prepared = _source(chosen)
+    name = chosen.name or chosen.predictions.resolve().name
+    if name in ROWS or not name.strip():
+        raise BadInput(f"--name {name!r}: is a calibration row's name; choose another with --name")
+    protocol = source.protocol
+    body = chosen.body or (prepared.body_file if prepared is not None else None)
+    request = ScoreRequest(
+        protocol, chosen.predictions, name, chosen.pattern, chosen.runs, body, chosen.force, chosen.alpha, prepared
+    )
+    results = []
+    for scene in chosen.scene or _with_folders(source.scenes, chosen.predictions, chosen.pattern):
+        progress.say(f"{protocol.name} {scene}: predictions {name}, {protocol.profile} profile")
+        results.append(score_scene(request, source, scene, progress))
+    for result in results:
+        found = result.record["about"]["predictions"]
+        for kind in ("missing", "surplus"):
+            for path in found[kind]:
+                progress.say(f"{result.scene}: {kind}: {path}")
+        for note in [*found["notes"], *found["doubts"]]:
+            progress.say(f"{result.scene}: {note}")
+    return results
 
 
 def _source(chosen: ScoreOptions) -> tuple[DataSource, Prepared | None]:

@@ -10,12 +10,12 @@ import pytest
 from PIL import Image
 
 from ihbench import atomic
+from ihbench.api import load_scene
 from ihbench.data_source import standin_root
 from ihbench.errors import BadInput
 from ihbench.predictions import find_alpha, find_predictions, read_image
 from ihbench.prepared import read_prepared
 from ihbench.progress import Progress
-from ihbench.run_loop import load_scene
 from ihbench.views import TestViewKey, open_scene
 
 KEYS = [TestViewKey(c, f, f"cam{c}") for c in (1, 2) for f in (0, 30)]

@@ -1,0 +1,298 @@
+"""The commands as functions: `ihbench.run`, `load_scene`, `ablate` and `score`, with the command line's own checks.
+
+What is given is held against the types and bounds of the commands' options (`ihbench.bounds`), after numpy's numbers
+have become Python's and lists tuples. Whatever does not fit is one `BadInput`, before anything is read or written.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+
+from ihbench import bounds, registry
+from ihbench.bounds import SEEDS
+from ihbench.commands.device import check_device
+from ihbench.commands.keep import check_keep
+from ihbench.commands.scene_choice import OcclusionChoice, ProtocolChanges
+from ihbench.errors import BadInput
+from ihbench.paths import user_path
+from ihbench.progress import Progress
+from ihbench.protocol import Protocol, load_protocol
+from ihbench.results import RunResult
+
+if TYPE_CHECKING:
+    from ihbench.body import Body
+    from ihbench.views import OccludedScene
+
+Occlusion = str | Mapping[str, Any] | None  # a rule's name, or rule, fraction, covers as on the command line
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Arguments(ProtocolChanges):
+    """What every function takes."""
+
+    protocol: str
+    profile: str | None
+    data: Path | None
+    body: Path | None
+    progress: Progress = field(default_factory=Progress)
+
+    def chosen(self) -> Protocol:
+        """The protocol with its changes."""
+        return self.apply(load_protocol(self.protocol, self.profile or "quick"))[0]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _SceneArguments(_Arguments):
+    scene: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class _RunArguments(_SceneArguments):
+    method: str
+    runs: Path
+    seed: Annotated[int, SEEDS]
+    device: Literal["cpu", "cuda"]
+    force: bool
+    keep: tuple[str, ...]
+
+
+def run(
+    protocol: str | Path = "zju_occ",
+    scene: str = "standin-1",
+    *,
+    method: str = "inpainthuman",
+    profile: str = "quick",
+    data: Path | str | None = None,
+    runs: Path | str = "runs",
+    body: Path | str | None = None,
+    seed: int = 0,
+    device: str = "cpu",
+    force: bool = False,
+    keep: Sequence[str] = (),
+    image_size: int | None = None,
+    train_frames: str | None = None,
+    test_frames: str | None = None,
+    occlusion: Occlusion = None,
+    progress: Progress | None = None,
+    **switches: Any,
+) -> RunResult:
+    """Run one method on one scene with one seed, as `ihbench run` does; `switches` are fields of the method's
+    configuration (`**{"inpaint.on": False}` for those of a part).
+
+    `train_frames` and `test_frames` are "START:STOP:STEP"; `occlusion` is a rule's name, or a mapping with any of
+    "rule", "fraction" and "covers". Raises `BadInput` for anything the caller got wrong. Divergence and failure are
+    statuses of the result.
+    """
+    for name, value in (("scene", scene), ("seed", seed)):
+        if isinstance(value, list | tuple | set | range | np.ndarray) and np.ndim(list(value)):
+            raise BadInput(
+                f"{name} {bounds.shown(value)}: expected one; call ihbench.run for each, or ihbench.ablate"
+            )
+    given = _given(
+        _RunArguments,
+        dict(protocol=protocol, scene=scene, method=method, profile=profile, data=data, runs=runs, body=body,
+             seed=seed, device=device, force=force, keep=keep, progress=progress),
+        dict(image_size=image_size, train_frames=train_frames, test_frames=test_frames), occlusion,
+    )  # fmt: skip
+    from ihbench.data_source import locate
+    from ihbench.run_loop import RunRequest, configuration, run_scene
+
+    check_device(given.device)
+    chosen = given.chosen()
+    config = configuration(given.method, chosen.profile, {name: _plain(value) for name, value in switches.items()})
+    check_keep(given.keep, config)
+    request = RunRequest(
+        chosen, given.method, config, given.seed, given.device, given.runs, given.body, given.force, given.keep
+    )
+    return run_scene(request, locate(chosen, given.data, (given.scene,)), given.scene, given.progress)
+
+
+def load_scene(
+    protocol: str | Path = "zju_occ",
+    scene: str = "standin-1",
+    *,
+    profile: str = "quick",
+    data: Path | str | None = None,
+    body: Path | str | None = None,
+    image_size: int | None = None,
+    train_frames: str | None = None,
+    test_frames: str | None = None,
+    occlusion: Occlusion = None,
+    progress: Progress | None = None,
+) -> tuple[OccludedScene, Body]:
+    """Training and test views of one scene under a protocol, loaded lazily, and the body model of its poses.
+
+    Frames and occlusion as in `run`. Raises `BadInput` for anything the caller got wrong.
+    """
+    given = _given(
+        _SceneArguments,
+        dict(protocol=protocol, scene=scene, profile=profile, data=data, body=body, progress=progress),
+        dict(image_size=image_size, train_frames=train_frames, test_frames=test_frames), occlusion,
+    )  # fmt: skip
+    from ihbench.data_source import locate
+    from ihbench.views import open_scene
+
+    chosen = given.chosen()
+    capture, model = locate(chosen, given.data, (given.scene,)).open(given.scene, given.body, given.progress)
+    return open_scene(capture, chosen), model
+
+
+@dataclass(frozen=True)
+class Ablation:
+    """What `ablate` found: the table as Markdown and as numbers, and the runs that were done."""
+
+    text: str
+    numbers: dict[str, Any]
+    results: list[RunResult]
+    problems: list[str]  # of runs that are not done
+
+
+def ablate(
+    protocol: str | Path = "zju_occ",
+    scene: str | Sequence[str] = (),
+    *,
+    method: str = "inpainthuman",
+    ladder: str = "",
+    vary: Mapping[str, Sequence[Any]] | None = None,
+    switches: Mapping[str, Any] | None = None,
+    keep: Sequence[str] = (),
+    seed: int | Sequence[int] = (0, 1, 2),
+    profile: str = "quick",
+    data: Path | str | None = None,
+    runs: Path | str = "runs",
+    body: Path | str | None = None,
+    device: str = "cpu",
+    workers: int | None = None,
+    share: bool = True,
+    out: Path | str | None = None,
+    image_size: int | None = None,
+    train_frames: str | None = None,
+    test_frames: str | None = None,
+    occlusion: Occlusion = None,
+    progress: Progress | None = None,
+) -> Ablation:
+    """What each component of a method is worth, as `ihbench ablate` does: a registered ladder, or a grid `vary` of
+    switch -> values. `switches` are set on every rung (`--set`). No scene means all that the protocol names.
+
+    In a script that starts workers, call it under `if __name__ == "__main__":`; `workers=0` starts none. Raises
+    `BadInput` for anything the caller got wrong.
+    """
+    from ihbench.commands.ablate import AblateOptions, ablated, write_out
+
+    grids = {} if vary is None else vary
+    for name, value in (("vary", grids), ("switches", switches or {})):
+        if not isinstance(value, Mapping):
+            raise BadInput(f"{name} {bounds.shown(value)}: expected a mapping from switches to values")
+    values = {name: _several(value) for name, value in grids.items()}
+    given = _given(
+        AblateOptions,
+        dict(protocol=protocol, scene=_several(scene), method=method, profile=profile, data=data, runs=runs,
+             body=body, ladder=ladder, keep=keep, seed=_several(seed), device=device, workers=workers,
+             share=share, out=out),
+        dict(image_size=image_size, train_frames=train_frames, test_frames=test_frames), occlusion,
+    )  # fmt: skip
+    told = _progress(progress)
+    fixed = {name: _plain(value) for name, value in (switches or {}).items()}
+    text, numbers, outcomes = ablated(given, values, fixed, told)
+    write_out(given, text, numbers)
+    return Ablation(
+        text,
+        numbers,
+        [outcome.result for outcome in outcomes if outcome.result is not None],
+        [f"{o.cell.name}: {o.problem or (o.result and o.result.outcome)}" for o in outcomes if not o.done],
+    )
+
+
+def score(
+    predictions: Path | str,
+    protocol: str | Path | None = None,
+    scene: str | Sequence[str] = (),
+    *,
+    prepared: Path | str | None = None,
+    name: str | None = None,
+    pattern: str | None = None,
+    alpha: str | None = None,
+    profile: str | None = None,
+    data: Path | str | None = None,
+    runs: Path | str = "runs",
+    body: Path | str | None = None,
+    force: bool = False,
+    image_size: int | None = None,
+    train_frames: str | None = None,
+    test_frames: str | None = None,
+    occlusion: Occlusion = None,
+    progress: Progress | None = None,
+) -> list[RunResult]:
+    """Score a folder of images that somebody else's code rendered, as `ihbench score` does: a result for each scene.
+
+    What is missing or doubtful stands in `result.record["about"]["predictions"]`, and `progress` says it. Raises
+    `BadInput` for anything the caller got wrong.
+    """
+    from ihbench.commands.score import ScoreOptions, scored
+
+    given = _given(
+        ScoreOptions,
+        dict(predictions=predictions, protocol=protocol, scene=_several(scene), prepared=prepared, name=name,
+             pattern=pattern, alpha=alpha, profile=profile, data=data, runs=runs, body=body, force=force),
+        dict(image_size=image_size, train_frames=train_frames, test_frames=test_frames), occlusion,
+    )  # fmt: skip
+    return scored(given, _progress(progress))
+
+
+def _given(kind: type[Any], values: dict[str, Any], changes: dict[str, Any], occlusion: Occlusion) -> Any:
+    """The options, checked. Raises `BadInput` under the argument's own name."""
+    values, known = {**values, **changes}, {f.name: str(f.type) for f in fields(kind)}
+    if "progress" in values:
+        values["progress"] = _progress(values["progress"])
+    for name, value in values.items():
+        value = _plain(value)
+        if isinstance(value, str | os.PathLike):
+            value = user_path(value, name) if "Path" in known[name] else os.fspath(value)
+        values[name] = value
+    given = kind(**values, occlusion=_occlusion(occlusion))
+    bounds.check(given, "")
+    return given
+
+
+def _progress(progress: Any) -> Progress:
+    if progress is not None and not isinstance(progress, Progress):
+        raise BadInput(f"progress {bounds.shown(progress)}: expected an ihbench.progress.Progress, or None")
+    return Progress() if progress is None else progress
+
+
+def _occlusion(value: Occlusion) -> OcclusionChoice:
+    given = {"rule": value} if isinstance(value, str) else {} if value is None else value
+    if not isinstance(given, Mapping):
+        raise BadInput(
+            f"occlusion {bounds.shown(value)}: expected a rule's name, or a mapping of rule, fraction, covers"
+        )
+    known = [f.name for f in fields(OcclusionChoice)]
+    for name in given:
+        if name not in known:
+            raise BadInput(f"occlusion {name!r}: {registry.nearest(str(name), known)}")
+    plain = {name: _plain(part) for name, part in given.items()}
+    fraction = plain.get("fraction")
+    if isinstance(fraction, tuple):
+        raise BadInput(f"occlusion.fraction {bounds.shown(fraction)}: expected one number; call once for each")
+    return OcclusionChoice(plain.get("rule"), () if fraction is None else (fraction,), plain.get("covers"))
+
+
+def _several(value: Any) -> Any:
+    """A value on its own as a tuple of it."""
+    plain = _plain(value)
+    return plain if isinstance(plain, tuple) else (plain,)
+
+
+def _plain(value: Any) -> Any:
+    """numpy's and torch's numbers as Python's, lists and arrays as tuples; anything else as it is."""
+    if isinstance(value, str | bytes | os.PathLike):
+        return value
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    return tuple(_plain(item) for item in value) if isinstance(value, list | tuple | range) else value
