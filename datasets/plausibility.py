@@ -139,6 +139,7 @@ def share_inside(points: Array, region: Mask) -> float:
     return float(hits) / len(points)
 
 
+@np.errstate(all="ignore")  # absurd numbers overflow, and are named
 def examine(
     capture: CaptureFolder,
     views: Sequence[tuple[int, int]],  # (camera, frame) that have image, mask and pose
@@ -319,7 +320,7 @@ def _check_placement(
             small += [(camera, float(np.median(heights)))] if np.median(heights) < SMALL else []
             cut += [(camera, share)] if share < 0.4 else []
     texts = {
-        "far": "the body is {:.0f} m in front of it, more than " + f"{FARTHEST:.0f} m: t or transl look like ",
+        "far": "the body is {:.4g} m in front of it, more than " + f"{FARTHEST:.0f} m: t or transl look like ",
         "near": "the body is {:.3g} m in front of it, less than "
         + f"{NEAREST} m: t or transl are not in metres, or one of them is missing",
         "behind": "sees no body in the sampled frames; it is {:.3g} m behind it: expected R, t from world to camera, "
@@ -721,8 +722,8 @@ def _size(fits: Sequence[Overlap]) -> tuple[float, str] | None:
     there, before = float(np.mean(there)), float(np.mean([fit.iou[""] for fit in fits]))
     if 0.75 < factor < 1.33 or not 0.6 < x / y < 1.6 or there < 0.5 or before > 0.5:
         return None
-    relation = f"{factor:.2g} times as large" if factor > 1 else f"{1 / factor:.2g} times smaller"
-    text = f"the body is drawn {relation} than the masks show it"
+    relation = f"{factor:.2g} times as large as" if factor > 1 else f"{1 / factor:.2g} times smaller than"
+    text = f"the body is drawn {relation} the masks show it"
     return there - before, f"{text}; check the focal lengths and the units of t and transl"
 
 
