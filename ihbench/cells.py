@@ -14,6 +14,7 @@ from typing import Any
 
 from ihbench.data_source import DataSource
 from ihbench.errors import BadInput
+from ihbench.failures import one_line
 from ihbench.gpu_slots import only
 from ihbench.interruption import GRACE, end_with_parent, interruptible, reason_of
 from ihbench.progress import Progress
@@ -79,10 +80,13 @@ def run_cells(
 def _in_this_process(cell: Cell) -> CellOutcome:
     try:
         return CellOutcome(cell, run_scene(cell.request, cell.source, cell.scene, Progress.silent()))
-    except BadInput as error:
-        return CellOutcome(cell, None, str(error))
-    except OSError as error:  # a folder that cannot be made, a disk that went away
-        return CellOutcome(cell, None, f"{type(error).__name__}: {error}")
+    except Exception as error:  # one cell takes no other along
+        return CellOutcome(cell, None, _told(error))
+
+
+def _told(error: Exception) -> str:
+    """An exception in one line."""
+    return str(error) if isinstance(error, BadInput) else one_line(f"{type(error).__name__}: {error}")
 
 
 def _side_by_side(
@@ -158,12 +162,10 @@ def _child(connection: Connection, request: RunRequest, source: DataSource, scen
             torch.set_num_threads(threads)
             cv2.setNumThreads(threads)
             folder = str(run_scene(request, source, scene, Progress.silent()).folder)
-        except BadInput as error:
-            problem = str(error)
         except KeyboardInterrupt as stop:
             problem = reason_of(stop)
         except Exception as error:
-            problem = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else 'no message'}"
+            problem = _told(error)
     with suppress(OSError), connection:  # the one who asked may be gone
         connection.send((folder, problem))
 

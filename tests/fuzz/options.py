@@ -198,7 +198,8 @@ class World:
         own |= {
             "HOME": str(self.root / "home"),
             "IHBENCH_CACHE": str(self.root / "cache"),
-            "TORCH_HOME": str(self.root),
+            "TORCH_HOME": str(self.root / "cache"),
+            "MPLCONFIGDIR": str(self.root / "cache"),
         }
         (self.root / "tmp").mkdir(exist_ok=True)
         before = Path.cwd()
@@ -257,7 +258,7 @@ def cut_short() -> Iterator[None]:
         *("ihbench.run_loop.run_scene", "ihbench.cells.run_scene", "ihbench.metrics.check.check"),
         *("ihbench.stress.run.run_cases", "ihbench.kernels.table.run_kernels", "ihbench.weights.fetch"),
         "ihbench.methods.inpainthuman.inpainting.paint_table.paint_scene",
-        "ihbench.methods.inpainthuman.inpainting.train_mini.MiniTrainer.run",
+        "ihbench.methods.inpainthuman.inpainting.crop_album.CropAlbum.make",
         "ihbench.datasets.standin.photograph.photograph",
     )
     with contextlib.ExitStack() as stack:
