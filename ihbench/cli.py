@@ -106,7 +106,7 @@ def _tell(argv: list[str], failure: Failure) -> int:
     """Say what went wrong, wherever it can still be said."""
     streams.say(f"ihbench: {failure.text}", sys.stderr)
     with suppress(OSError, ValueError):
-        if "--json" in argv and streams.failure() is None:
+        if "--json" in argv and streams.failure() is None and not streams.used():  # the result itself may be out
             print(json.dumps({"status": failure.status, "error": failure.text}))
         sys.stdout.flush()
     if streams.failure() is not None:

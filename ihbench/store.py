@@ -300,7 +300,7 @@ def _checked(file: Path, record: Any) -> Record:
         version += 1
     if found := record_fault(record):
         raise DamagedRecord(f"{file}: {found}; run the same command with --force")
-    if identity_digest(record["identity"]) != record["digest"]:
+    if identity_digest(atomic.encode(record["identity"])) != record["digest"]:
         raise BadInput(f"{file}: its identity is not the one of its digest: edited, or of another run; restore it")
     return record
 

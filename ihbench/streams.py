@@ -31,6 +31,7 @@ class Stdout(io.TextIOWrapper):
     """Standard output that remembers why it could not be written: the exception itself does not name its file."""
 
     failure: OSError | None = None
+    used = False  # whether anything has been printed
 
     def __init__(self, plain: io.TextIOWrapper):
         super().__init__(
@@ -43,6 +44,7 @@ class Stdout(io.TextIOWrapper):
         self.plain = plain  # would close what both write to when nobody held it
 
     def write(self, text: str, /) -> int:
+        self.used = self.used or bool(text)
         try:
             return super().write(text)
         except OSError as error:
@@ -125,6 +127,12 @@ def styled() -> Iterator[None]:
 def failure() -> OSError | None:
     """Why stdout cannot be written, where that has happened."""
     return getattr(sys.stdout, "failure", None)
+
+
+def used() -> bool:
+    """Whether anything has been printed on stdout, as far as it can be told: a file's own lines are not counted."""
+    out = sys.stdout
+    return out.used if isinstance(out, Stdout) else isinstance(out, io.StringIO) and out.tell() > 0
 
 
 def drop(stream: TextIO) -> None:

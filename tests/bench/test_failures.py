@@ -127,6 +127,16 @@ def shell(line, **variables):
     return done.returncode, done.stdout, done.stderr.decode()
 
 
+def test_json_stays_one_object_when_something_fails_after_the_result(monkeypatch, bench):
+    def late(_argv):
+        print(json.dumps({"result": 1}))
+        raise OSError(errno.EIO, "Input/output error", "/x")
+
+    monkeypatch.setattr("ihbench.commands.list.main", late)
+    outcome = bench("list", "--json")
+    assert (outcome.status, json.loads(outcome.out)) == (2, {"result": 1})
+
+
 @pytest.mark.parametrize("encoding", ["ascii", "cp1252", "utf-8"])
 def test_an_encoding_that_lacks_signs_loses_no_number(encoding):
     status, out, err = shell("$IHBENCH list --json && $IHBENCH list metrics", PYTHONIOENCODING=encoding)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -71,6 +72,14 @@ def test_a_new_run_is_running_and_says_where_it_came_from(tmp_path):
     assert record["machine"]["cores"] >= 1
     assert {"ihbench", "git", "packages"} <= record["provenance"].keys()
     assert not run.finished
+
+
+@pytest.mark.parametrize(
+    "change", [{"method": "nan"}, {"scene": "'inf"}, {"config": {"clip": math.inf, "x": math.nan}}], ids=str
+)
+def test_names_and_values_that_json_lacks_come_back(tmp_path, change):
+    made = RunFolder.create(tmp_path, replace(IDENTITY, **change))
+    assert RunFolder.open(made.path).record["digest"] == made.record["digest"]
 
 
 def test_a_finished_run_is_found_not_made_again(tmp_path):
