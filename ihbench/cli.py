@@ -23,6 +23,7 @@ COMMANDS = {
     "prepare": "hand out the occluded training set for other people's code",
     "ablate": "what each component of a method is worth, in quality and in seconds",
     "report": "tables of finished runs, and error against run time",
+    "runs": "list the runs in a folder, one line each; remove some",
     "metrics": "check every metric against oracles, other libraries and stored values",
     "weights": "learned weights the bench may not ship: list, where, fetch",
     "export": "an avatar's Gaussians as a splat PLY",

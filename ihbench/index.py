@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import re
 import sqlite3
 import time
 import zlib
@@ -24,14 +23,13 @@ from ihbench import __version__, removal
 from ihbench.errors import BadInput
 from ihbench.metrics import Mean
 from ihbench.results import RunResult, read_result, without_copies
-from ihbench.store import HASH_LENGTH, KILLED
+from ihbench.store import KILLED, OUR_NAME
 
 UNREADABLE = "unreadable"
 FILTERS = ("protocol", "scene", "method", "profile", "seed", "status")
 FILES = ("run.json", "scores.jsonl", "calibration.jsonl", "curve.jsonl")  # and presets/
 OURS = 0x69686265  # the database's application_id
 FORMER = b"CREATE TABLE about (signature TEXT"  # in the first page of an index of version 0.1
-OUR_NAME = re.compile(f"__[0-9a-f]{{{HASH_LENGTH}}}$")  # of a run folder, even of one that has lost its record
 WAIT = 10.0  # s for another process that writes the index
 FRESH = 10**8  # ns; files that have changed within this time are read again: they may change within the same tick
 
@@ -148,7 +146,7 @@ class Index:
                 folders = [Path(entry.path) for entry in entries if entry.is_dir(follow_symlinks=False)]
         except OSError as error:
             raise BadInput(f"{self.runs}: no folder of runs ({error.strerror}); give the --runs of a run") from error
-        return (f for f in folders if os.path.lexists(f / "run.json") or OUR_NAME.search(f.name))
+        return filter(_holds_a_run, folders)
 
     # --- the database ---
 
@@ -224,6 +222,13 @@ class Index:
             return False
         own = head[:15] == b"SQLite format 3" and int.from_bytes(head[68:72], "big") == OURS
         return own or FORMER in head
+
+
+def _holds_a_run(folder: Path) -> bool:
+    """Whether there is a record, or numbers of a run that has lost its record."""
+    if os.path.lexists(folder / "run.json"):
+        return True
+    return bool(OUR_NAME.search(folder.name)) and any(os.path.lexists(folder / name) for name in FILES)
 
 
 def signature(folder: Path) -> str:

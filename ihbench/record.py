@@ -110,6 +110,7 @@ class About(TypedDict):
     device: NotRequired[str]
     command: NotRequired[list[str]]
     provenance: NotRequired[str]
+    label: NotRequired[str]
     predictions: NotRequired[PredictionFiles]
     changed: NotRequired[list[str]]
     left_out: NotRequired[list[Omission]]

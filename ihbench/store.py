@@ -34,6 +34,7 @@ SCHEMA_VERSION = 1
 STATUSES = get_args(Status)
 FINISHED = ("done", "diverged", "skipped")  # running such a run again would end the same way
 HASH_LENGTH = 10
+OUR_NAME = re.compile(f"__[0-9a-f]{{{HASH_LENGTH}}}$")  # of a run folder, even of one that has lost its record
 LOCK = "lock"
 KILLED = "its process ended without a word: it was killed, or the machine went down"
 # what the bench writes into a run folder: whatever else lies there is the user's, and stays
@@ -361,6 +362,36 @@ def _is_ours(path: Path) -> bool:
     if top == "renders" and path.suffix == ".png":
         return path.stem.isdecimal()
     return path.suffix in WRITTEN.get(top, ()) or atomic.is_stray(path.name)
+
+
+def check_is_run(path: Path) -> None:
+    """Raise `BadInput` unless a run of this bench lies at `path`: one whose record says so, or whose name does where
+    the record is damaged or gone."""
+    if path.is_symlink():
+        raise BadInput(f"{path}: is a link; name the run folder itself")
+    if not OUR_NAME.search(path.resolve().name) or not path.is_dir():
+        RunFolder.open(path)
+
+
+def writer_of(path: Path) -> Path | None:
+    """The lock of a run that somebody is writing, else None."""
+    return path / LOCK if locks.is_held(path / LOCK) else None
+
+
+def remove_run(path: Path) -> Path | None:
+    """Remove what the bench wrote into a run folder, and the folder; where something else is in it, that stays, and
+    its path is returned. Raises `BadInput` for what is no run, for one that somebody writes, and where it may not go.
+    """
+    check_is_run(path)
+    advice = "check its permissions"
+    with locks.locked(path / LOCK, advice, wait=0), _movable(path):
+        removal.remove_written(path, lambda file: _is_ours(file) or file.name.startswith("run.json.damaged"))
+    for name in (LOCK, LOCK + locks.OWNER):
+        removal.discard_file(path / name)
+    with suppress(OSError):
+        path.rmdir()
+        return None
+    return removal.foreign(path, lambda _: False) or path
 
 
 def is_record(path: Path) -> bool:

@@ -95,7 +95,7 @@ class Bench:
     def run_words(self, *more: object, scene: str = "standin-1", method: str = "inpainthuman") -> list[str]:
         words = ["run", "--protocol", self.protocol, "--runs", self.runs, "--scene", scene, "--method", method]
         words += TINY_SWITCHES if method == "inpainthuman" else []
-        return [str(word) for word in (*words, *more)]
+        return [str(word) for word in (*words, "--full", *more)]
 
     def run(self, *more: object, scene: str = "standin-1", method: str = "inpainthuman") -> Outcome:
         """`ihbench run` under the tiny protocol."""

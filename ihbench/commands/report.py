@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -43,8 +44,11 @@ class ReportOptions:
     """Your copy of the data set, if runs used one and --preset asks for numbers that are not there yet."""
     body: Path | None = None
     """SMPL model file, likewise."""
-    format: str = "md"
-    """A registered report: md, tex (booktabs, for pdflatex), html (one file with its pictures inside)."""
+    format: str | None = None
+    """A registered report: md, tex (booktabs, for pdflatex), html (one file with its pictures inside). Without it a
+    terminal shows the headline table alone; files and pipes get md."""
+    full: bool = False
+    """The whole report in Markdown, on a terminal too."""
     figures: Path | None = None
     """Folder for diagrams of error against run time: PNG, SVG, and their numbers as CSV."""
     target: tuple[str, ...] = ()
@@ -76,7 +80,7 @@ def main(argv: list[str]) -> int:
     from ihbench.row_choice import Choice
 
     outputs.check_file(chosen.out)
-    write = registry.load("report", chosen.format)
+    write = registry.load("report", chosen.format or "md")
     only = {"fragment": True} if chosen.fragment else {}
     if only and "fragment" not in signature(write).parameters:
         raise BadInput(f"--fragment: the report {chosen.format!r} has no fragments; leave it out, or --format tex")
@@ -90,6 +94,11 @@ def main(argv: list[str]) -> int:
             f"no run folders under {chosen.runs} match; "
             "make one with: ihbench run --protocol zju_occ --scene standin-1"
         )
+    whole = chosen.full or chosen.fragment or chosen.format or chosen.out or chosen.figures
+    named = *chosen.preset, *chosen.target, *chosen.rows, *chosen.metrics, *chosen.regions, *chosen.names
+    if _on_terminal() and not whole and not named:
+        print(headline(results, left_out), end="")
+        return 0
     if chosen.preset:
         results = [_with_presets(result, chosen) for result in results]
     results = Choice(chosen.rows, chosen.metrics, chosen.regions, chosen.names).applied(results)
@@ -132,6 +141,15 @@ def _matching(chosen: ReportOptions) -> tuple[list[RunResult], list[str]]:
         return [], []
     wanted = {name: getattr(chosen, name) for name in ("protocol", "method", "scene", "profile")}
     return Index(chosen.runs).results(**{name: value for name, value in wanted.items() if value is not None})
+
+
+def _on_terminal() -> bool:
+    return sys.stdout.isatty()
+
+
+def headline(results: Sequence[RunResult], left_out: Sequence[str] = ()) -> str:
+    """The headline table of some runs, as wide as the terminal, 80 columns at most."""
+    return registry.load("table", "headline")(results, left_out, shutil.get_terminal_size().columns)
 
 
 def say_left_out(lines: Sequence[str]) -> None:

@@ -14,6 +14,7 @@ from ihbench.bounds import SEEDS, refuse_repeated
 from ihbench.commands.device import check_device
 from ihbench.commands.keep import check_keep
 from ihbench.commands.parse import options
+from ihbench.commands.report import headline
 from ihbench.commands.scene_choice import SceneChoice
 from ihbench.errors import BadInput
 
@@ -31,6 +32,8 @@ class RunOptions(SceneChoice):
     """Switches that the plan must not change for this scene; "all" keeps everything."""
     force: bool = False
     """Run again even if the same run is done."""
+    full: bool = False
+    """Print the whole report in Markdown, and not the headline table alone."""
     like: Path | None = None
     """Repeat the run in this folder, from its record: protocol, method, switches, scene and seed are its own. Beside
     it only --data, --body, --runs, --device, --force and --json."""
@@ -50,6 +53,8 @@ class LikeOptions:
     """Where to fit."""
     force: bool = False
     """Run again even if the same run is done."""
+    full: bool = False
+    """Print the whole report in Markdown, and not the headline table alone."""
     json: bool = False
     """Print one JSON object on stdout and nothing else there."""
 
@@ -112,7 +117,7 @@ def _run(chosen: Any) -> int:
             for seed in chosen.seed:
                 progress.say(f"{protocol.name} {scene}: {chosen.method}, {chosen.profile} profile, seed {seed}")
                 results.append(run_scene(replace(request, seed=seed), source, scene, progress))
-    return _print(results, chosen.json)
+    return _print(results, chosen)
 
 
 def _repeat(chosen: LikeOptions) -> int:
@@ -130,17 +135,18 @@ def _repeat(chosen: LikeOptions) -> int:
     result = run_scene(request, locate(request.protocol, chosen.data, (scene,)), scene, progress)
     for line in differences(chosen.like, result):
         progress.say(f"repeated: {line}")
-    return _print([result], chosen.json)
+    return _print([result], chosen)
 
 
-def _print(results: list[RunResult], as_one_object: bool) -> int:
+def _print(results: list[RunResult], chosen: Any) -> int:
     from ihbench.results import as_json
 
-    text = registry.load("report", "md")(results)
-    if as_one_object:
+    if chosen.json:
         print(json.dumps(as_json(results), allow_nan=False))
+    elif not chosen.full:
+        print(headline(results), end="")
     else:
-        print(text)
+        print(registry.load("report", "md")(results))
         for result in results:
             done = result.status == "done"
             print(f"{result.scene}: {result.folder / 'contact_sheet.png' if done else result.outcome}")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from ihbench import registry
 from ihbench.commands.parse import options
+from ihbench.commands.report import headline
 from ihbench.commands.scene_choice import OcclusionChoice, ProtocolChanges
 from ihbench.errors import BadInput
 
@@ -51,6 +52,8 @@ class ScoreOptions(ProtocolChanges):
     """Where run folders lie."""
     force: bool = False
     """Score again even if the same images have been."""
+    full: bool = False
+    """Print the whole report in Markdown, and not the headline table alone."""
     json: bool = False
     """Print one JSON object on stdout and nothing else there."""
 
@@ -70,7 +73,7 @@ def main(argv: list[str]) -> int:
             run["predictions"] = result.record["about"]["predictions"]
         print(json.dumps(told, allow_nan=False))
     else:
-        print(registry.load("report", "md")(results))
+        print(registry.load("report", "md")(results) if chosen.full else headline(results), end="")
     return 0 if complete and all(result.status == "done" for result in results) else 1
 
 

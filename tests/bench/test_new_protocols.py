@@ -44,7 +44,18 @@ def test_any_person_of_a_stand_in_can_be_named():
 
 
 def test_a_video_of_ones_own_runs_with_its_own_body(own_video, tmp_path, mannequin, bench, capsys):
-    words = ["run", "--protocol", "custom_occ", "--data", own_video, "--runs", tmp_path, "--method", "mannequin"]
+    words = [
+        "run",
+        "--protocol",
+        "custom_occ",
+        "--data",
+        own_video,
+        "--runs",
+        tmp_path,
+        "--method",
+        "mannequin",
+        "--full",
+    ]
     with bench.in_its_world():
         status = main([str(w) for w in (*words, "--occlusion.rule", "central-band", "--occlusion.fraction", "0.3")])
     assert status == 0, capsys.readouterr().err
@@ -116,6 +127,7 @@ def test_the_released_score_stands_beside_the_held_out_one(tmp_path, bench, mann
     root = ocmotion_capture.OcMotionStandIn.ensure(tmp_path / "oc", 0, ["standin-1"], {})
     words = [
         "run",
+        "--full",
         "--protocol",
         "ocmotion_visible",
         "--data",

@@ -204,14 +204,30 @@ def test_calibration_is_computed_once_for_all_methods_and_seeds(bench_with_run, 
     assert len(rows) == 1
 
 
-def test_force_computes_the_calibration_again(bench, mannequin):
+def test_force_and_damage_compute_the_calibration_again(bench, mannequin):
     assert bench.run(method=mannequin).status == 0
     (folder,), (shared,) = bench.folders(), (bench.runs / "calibration").iterdir()
     before = (folder / "calibration.jsonl").read_bytes()
-    shared.write_bytes(before[: len(before) // 2])
-    assert bench.run("--seed", 1, method=mannequin).status == 2
+    lines = before.splitlines(keepends=True)
+    for seed, damage in enumerate((before[: len(before) // 2], b"".join(lines[:-1]), b"", before * 2), 1):
+        shared.write_bytes(damage)
+        assert bench.run("--seed", seed, method=mannequin).status == 0
+        assert shared.read_bytes() == before
+    shared.write_bytes(before.replace(b"inf", b"9.0"))
     assert bench.run("--force", method=mannequin).status == 0
     assert (folder / "calibration.jsonl").read_bytes() == shared.read_bytes() == before
+
+
+def test_the_headline_comes_first_in_80_columns_then_the_picture(bench, mannequin):
+    words = [word for word in bench.run_words(method=mannequin) if word != "--full"]
+    lines = bench(*words).out.splitlines()
+    assert lines[0].startswith("zju_occ@1, quick profile, stand-in v2")
+    assert lines[2].split()[:3] == ["region", "body", "PSNR"]
+    assert lines[4].split()[0] == "mannequin"
+    (folder,) = bench.folders()
+    assert f"contact sheet: {folder / 'contact_sheet.png'}" in lines
+    assert [line for line in lines if len(line) > 80 and not line.startswith("contact sheet: ")] == []
+    assert "\x1b" not in "".join(lines)
 
 
 # ------------------------------------------------------------------------- occlusion, and what the plan leaves out

@@ -41,7 +41,7 @@ def truths(bench, tmp_path):
 
 
 def score(bench, folder, *more):
-    words = ["score", "--protocol", bench.protocol, "--predictions", folder, "--runs", bench.runs]
+    words = ["score", "--protocol", bench.protocol, "--predictions", folder, "--runs", bench.runs, "--full"]
     return bench(*words, "--scene", "standin-1", "--profile", "quick", *more)
 
 
@@ -83,7 +83,7 @@ def test_missing_and_surplus_files_are_reported_and_the_rest_is_scored(bench, tr
 def test_strays_of_another_size_and_kind_do_not_stop_scoring(bench, truths):
     picture(truths / "0 first.png", size=99)
     (truths / "1 second.png").write_bytes(b"no picture")
-    words = ["score", "--protocol", bench.protocol, "--predictions", truths, "--runs", bench.runs]
+    words = ["score", "--protocol", bench.protocol, "--predictions", truths, "--runs", bench.runs, "--full"]
     outcome = bench(*words, "--scene", "standin-1")
     assert outcome.status == 0, outcome.err
     assert "quick profile" in outcome.out
@@ -93,7 +93,7 @@ def test_strays_of_another_size_and_kind_do_not_stop_scoring(bench, truths):
 
 def test_an_image_size_needs_no_profile(bench, tmp_path):
     """Which of the profiles is told by the views that have images."""
-    words = ["score", "--protocol", bench.protocol, "--predictions", tmp_path / "p", "--runs", bench.runs]
+    words = ["score", "--protocol", bench.protocol, "--predictions", tmp_path / "p", "--runs", bench.runs, "--full"]
     with bench.in_its_world():
         scene, _ = load_scene(str(bench.protocol), "standin-1", profile="quick")
         for key in scene.test_keys:

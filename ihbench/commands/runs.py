@@ -1,0 +1,244 @@
+"""`ihbench runs list|rm`: what a folder of runs holds, and removing runs from it."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from ihbench import atomic, registry
+from ihbench.commands.parse import options
+from ihbench.errors import BadInput
+
+if TYPE_CHECKING:
+    from ihbench.results import RunResult
+
+DAMAGED = "damaged"
+FILTERS = ("protocol", "scene", "method", "profile", "seed", "status")
+UNITS = ("B", "kB", "MB", "GB", "TB")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Filters:
+    runs: Path = Path("runs")
+    """Folder of run folders."""
+    protocol: str | None = None
+    """Only runs under this protocol, with or without its @version."""
+    scene: str | None = None
+    """Only runs on this scene."""
+    method: str | None = None
+    """Only runs of this method."""
+    profile: str | None = None
+    """Only runs under this profile."""
+    seed: int | None = None
+    """Only runs with this seed."""
+    status: str | None = None
+    """Only runs that are running, done, diverged, failed, interrupted, skipped, timeout or damaged."""
+    json: bool = False
+    """Print one JSON object on stdout and nothing else there."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class List(Filters):
+    """One line a run: status, what it is, its headline number, age, size on disk, folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Remove(Filters):
+    """Remove runs, named or chosen by filters. Only what the bench wrote goes, and no run that is being written."""
+
+    run: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    """Run folders, or their names under --runs."""
+    yes: bool = False
+    """Do not ask. Needed where nobody can be asked."""
+
+
+Command = (
+    Annotated[List, tyro.conf.subcommand("list", description=List.__doc__)]
+    | Annotated[Remove, tyro.conf.subcommand("rm", description=Remove.__doc__)]
+)
+
+
+def main(argv: list[str]) -> int:
+    chosen = options(Command, argv, "runs", "What a folder of runs holds; removing runs.")  # type: ignore[arg-type]
+    return _remove(chosen) if isinstance(chosen, Remove) else _list(chosen)
+
+
+def _list(chosen: Filters) -> int:
+    rows = _matching(chosen)
+    if chosen.json:
+        print(json.dumps({"runs": atomic.encode(rows)}, allow_nan=False))
+        return 0
+    columns = ("status", "protocol", "scene", "method", "profile", "seed", "headline", "age", "size", "folder")
+    cells = [columns, *(_cells(row) for row in rows)]
+    sizes = [max(len(line[k]) for line in cells) for k in range(len(columns) - 1)]
+    for line in cells:
+        padded = [f"{text:{size}}" for text, size in zip(line[:-1], sizes, strict=True)]
+        print("  ".join([*padded, line[-1]]))
+    return 0
+
+
+def _remove(chosen: Remove) -> int:
+    from ihbench.store import remove_run, writer_of
+
+    filters = [name for name in FILTERS if getattr(chosen, name) is not None]
+    if bool(chosen.run) == bool(filters):
+        raise BadInput("runs rm: either name run folders, or choose some by filters such as --status failed")
+    rows = list(_named(chosen)) if chosen.run else _matching(chosen)
+    written = [row for row in rows if writer_of(Path(row["folder"])) is not None]
+    if written and chosen.run:
+        raise BadInput(f"{written[0]['folder']}: is being written; wait for it to end. Nothing was removed")
+    for row in written:
+        print(f"ihbench: not removed, is being written: {row['folder']}", file=sys.stderr)
+    rows = [row for row in rows if row not in written]
+    if not rows:
+        raise BadInput(f"no run under {chosen.runs} matches that can be removed; see ihbench runs list")
+    if not _agreed(chosen, rows):
+        print("nothing was removed", file=sys.stderr)
+        return 1
+    removed, kept = [], {}
+    for row in rows:
+        left = remove_run(Path(row["folder"]))
+        removed.append(row["folder"])
+        if left is not None:
+            kept[row["folder"]] = str(left)
+            print(f"ihbench: kept, since the bench did not write it: {left}", file=sys.stderr)
+    if chosen.json:
+        print(json.dumps({"removed": removed, "kept": kept}))
+    else:
+        print(f"removed {_counted(rows)}")
+    return 0
+
+
+def _agreed(chosen: Remove, rows: list[dict[str, Any]]) -> bool:
+    """Whether these may go. Raises `BadInput` where nobody can be asked and --yes was not given."""
+    if chosen.yes:
+        return True
+    for row in rows:
+        print("would remove:", "  ".join(_cells(row)), file=sys.stderr)
+    if chosen.json or not (sys.stdin.isatty() and sys.stderr.isatty()):
+        raise BadInput(f"runs rm: would remove {_counted(rows)}; nothing was, add --yes")
+    print(f"remove {_counted(rows)}? [y/N] ", end="", file=sys.stderr, flush=True)
+    return sys.stdin.readline().strip().lower() in ("y", "yes")
+
+
+def _matching(chosen: Filters) -> list[dict[str, Any]]:
+    """The runs that the filters choose, oldest first. Damaged ones match no filter but their status."""
+    from ihbench.index import UNREADABLE, Index
+    from ihbench.store import STATUSES
+
+    if chosen.status is not None and chosen.status not in (*STATUSES, DAMAGED):
+        raise BadInput(f"--status {chosen.status}: {registry.nearest(chosen.status, [*STATUSES, DAMAGED])}")
+    wanted = {name: getattr(chosen, name) for name in FILTERS if getattr(chosen, name) is not None}
+    if chosen.status == DAMAGED:
+        wanted["status"] = UNREADABLE
+    index = Index(chosen.runs)
+    entries = index.query(**wanted)
+    results = {result.folder.name: result for result in index.results(**wanted)[0]} if entries else {}
+    return [_row(chosen.runs / entry["path"], entry, results.get(entry["path"])) for entry in entries]
+
+
+def _named(chosen: Remove) -> Iterator[dict[str, Any]]:
+    """The runs that are named, each once. Raises `BadInput` for one that is none."""
+    from ihbench.index import UNREADABLE
+    from ihbench.results import read_result
+    from ihbench.store import check_is_run
+
+    seen = set()
+    for named in chosen.run:
+        folder = named if os.path.lexists(named) else chosen.runs / named
+        check_is_run(folder)
+        if folder.resolve() in seen:
+            continue
+        seen.add(folder.resolve())
+        try:
+            result = read_result(folder)
+        except BadInput as error:
+            yield _row(folder, {"status": UNREADABLE, "reason": str(error)}, None)
+        else:
+            identity = {name: result.identity[name] for name in FILTERS[:-1]}
+            outcome = {
+                "status": result.status,
+                "reason": result.record["reason"],
+                "created": result.record["created"],
+            }
+            yield _row(folder, identity | outcome, result)
+
+
+def _row(folder: Path, entry: dict[str, Any], result: RunResult | None) -> dict[str, Any]:
+    from ihbench.index import UNREADABLE
+
+    name, value = _headline(result)
+    about = {key: entry.get(key) for key in ("protocol", "scene", "method", "profile", "seed", "reason", "created")}
+    status = DAMAGED if entry["status"] == UNREADABLE else entry["status"]
+    return {
+        "status": status,
+        **about,
+        "identity": name,
+        "value": value,
+        "bytes": _size(folder),
+        "folder": str(folder),
+    }
+
+
+def _headline(result: RunResult | None) -> tuple[str | None, float | None]:
+    """Identity and mean of the headline region's first metric; PSNR where it is there."""
+    from ihbench.metrics import Identity
+
+    if result is None or result.status != "done":
+        return None, None
+    region = result.record["about"]["headline"]
+    for identity, mean in result.rows[result.method].items():
+        if Identity.parse(identity).region == region and not mean.absent:
+            return identity, mean.value
+    return None, None
+
+
+def _size(folder: Path) -> int:
+    """Bytes of the files below a folder; links are not followed."""
+    total = 0
+    for where, _, names in os.walk(folder):
+        for name in names:
+            try:
+                total += os.lstat(os.path.join(where, name)).st_size
+            except OSError:
+                continue
+    return total
+
+
+def _cells(row: dict[str, Any]) -> tuple[str, ...]:
+    from ihbench.metrics.identity import metric_of
+    from ihbench.visible_text import visible
+
+    value = "" if row["value"] is None else metric_of(row["identity"]).text(row["value"])
+    named = (row[name] for name in ("status", "protocol", "scene", "method", "profile", "seed"))
+    texts = ("" if text is None else visible(str(text)) for text in named)
+    return (*texts, value, _age(row["created"]), _bytes(row["bytes"]), visible(row["folder"]))
+
+
+def _age(created: str | None) -> str:
+    if created is None:
+        return ""
+    seconds = (datetime.now(UTC) - datetime.fromisoformat(created)).total_seconds()
+    for unit, length in (("d", 86400), ("h", 3600), ("min", 60)):
+        if seconds >= length:
+            return f"{seconds / length:.0f} {unit}"
+    return "now"
+
+
+def _bytes(number: float) -> str:
+    k = 0
+    while number >= 1000 and k < len(UNITS) - 1:
+        number, k = number / 1000, k + 1
+    return f"{number:.0f} {UNITS[k]}"
+
+
+def _counted(rows: list[dict[str, Any]]) -> str:
+    return f"{len(rows)} run{'s' * (len(rows) != 1)}, {_bytes(sum(row['bytes'] for row in rows))}"

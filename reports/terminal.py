@@ -1,0 +1,127 @@
+"""The headline of some runs for a terminal: one table of at most 80 columns, then where the pictures are."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+
+from rich.cells import cell_len, set_cell_size
+
+from ihbench.calibration import ROWS
+from ihbench.metrics import Identity, macro_mean
+from ihbench.metrics.identity import metric_of
+from ihbench.reports.clock import one_clock
+from ihbench.reports.significance import scene_means
+from ihbench.results import TRACEBACK, RunResult
+from ihbench.row_labels import by_label
+from ihbench.visible_text import visible
+
+WIDTH = 80
+NARROWEST = 40
+NAME = 18  # columns that a row's name gets at least
+GAP = 2
+SHOWN = 6  # pictures, and runs that are not done, that are named one by one
+
+
+def write(results: Sequence[RunResult], left_out: Sequence[str] = (), width: int = WIDTH) -> str:
+    """Lines of at most `width` columns, but for paths, which are whole: of every protocol, profile and kind of data
+    the headline region's metrics by row, methods before calibration rows; runs that are not done; contact sheets."""
+    width = max(NARROWEST, min(width, WIDTH))
+    groups: dict[tuple[str, ...], list[RunResult]] = {}
+    for result in results:
+        groups.setdefault(result.group, []).append(result)
+    lines: list[str] = []
+    for runs in groups.values():
+        lines += [*_group(runs, width), ""]
+    unfinished = [run for run in results if run.status != "done"]
+    for run in unfinished[:SHOWN]:
+        reason = f" ({run.record['reason']})" if run.record["reason"] else ""
+        lines += _wrapped(f"not done: {run.method} on {run.scene}: {run.status}{reason}", width)
+        traceback = run.folder / TRACEBACK
+        lines.append(f"see {visible(str(traceback if traceback.is_file() else run.folder))}")
+    if len(unfinished) > SHOWN:
+        lines.append(f"not done: {len(unfinished) - SHOWN} more runs")
+    sheets = [run.folder / "contact_sheet.png" for run in results if run.status == "done"]
+    sheets = [sheet for sheet in sheets if sheet.is_file()]
+    lines += [f"contact sheet: {visible(str(sheet))}" for sheet in sheets[:SHOWN]]
+    if len(sheets) > SHOWN:
+        lines.append(f"contact sheet: {len(sheets) - SHOWN} more in the run folders")
+    if left_out:
+        told = f"left out: {len(left_out)} folder{'s' * (len(left_out) > 1)}; --full says which and why"
+        lines += _wrapped(told, width)
+    lines += _wrapped("all regions, seconds, notes and tests: --full", width)
+    return "\n".join(lines) + "\n"
+
+
+def _group(runs: Sequence[RunResult], width: int) -> list[str]:
+    protocol, _, profile, data = runs[0].group
+    title = _wrapped(f"{protocol}, {profile} profile, {data.replace('*', '')}", width)
+    done = [run for run in runs if run.status == "done"]
+    if not done:
+        return title
+    headline = done[0].record["about"]["headline"]
+    found = dict.fromkeys(i for run in done for i in run.rows[run.method])
+    in_headline = [i for i in found if Identity.parse(i).region == headline]
+    own = [run.rows[run.method] for run in done]
+    present = [i for i in in_headline if any(i in means and not means[i].absent for means in own)]
+    rows = _rows(done, present)
+    heads = [f"{metric_of(i).title} {metric_of(i).arrow}" for i in present] + ["fit s"]
+    table = [(visible(name), cells) for name, cells in [(f"region {headline}", heads), *rows]]
+    sizes = [max(cell_len(cells[k]) for _, cells in table) for k in range(len(heads))]
+    kept = list(range(len(heads)))
+    while len(kept) > 1 and NAME + sum(sizes[k] + GAP for k in kept) > width:
+        kept.pop(-2)  # the last metric; the seconds stay
+    room = width - sum(sizes[k] + GAP for k in kept)
+    room = min(room, max(cell_len(name) for name, _ in table))
+    lines = [
+        (_cut(name, room) + "".join(" " * (GAP + sizes[k] - cell_len(cells[k])) + cells[k] for k in kept)).rstrip()
+        for name, cells in table
+    ]
+    absent = [metric_of(i).title for i in in_headline if i not in present]
+    absent += [heads[k] for k in range(len(heads)) if k not in kept]
+    scenes = sorted({run.scene for run in done})
+    told = f"mean over test views of {', '.join(scenes) if len(scenes) <= SHOWN else f'{len(scenes)} scenes'}"
+    told += f"; not shown: {', '.join(absent)}" if absent else ""
+    return [*title, "", lines[0], "-" * max(map(cell_len, lines)), *lines[1:], "", *_wrapped(told, width)]
+
+
+def _rows(done: Sequence[RunResult], identities: Sequence[str]) -> list[tuple[str, list[str]]]:
+    """Name and cells of each row: the methods', with their further groups of test views, then the calibration's."""
+    rows = []
+    for label, group in by_label(done).items():
+        method = group[0].method
+        further = dict.fromkeys(row for run in group for row in run.rows if row.startswith(f"{method} ["))
+        seconds = [run.record["about"]["fit_seconds"] for run in group]
+        known = [value for value in seconds if value is not None]
+        fit = f"{sum(known) / len(known):.0f}" if known and one_clock(group) else "—"
+        rows.append((label, [*_cells(group, identities, method), fit]))
+        rows += [(label + row.removeprefix(method), [*_cells(group, identities, row), ""]) for row in further]
+    bounds = [row for row in ROWS if any(row in run.rows for run in done)]
+    return [*rows, *((row, [*_cells(done, identities, row), ""]) for row in bounds)]
+
+
+def _cells(runs: Sequence[RunResult], identities: Sequence[str], row: str) -> list[str]:
+    means = [scene_means(runs, identity, row) for identity in identities]
+    return [
+        metric_of(identity).text(macro_mean(found).value) if found else "—"
+        for identity, found in zip(identities, means, strict=True)
+    ]
+
+
+def _cut(name: str, room: int) -> str:
+    """A name in exactly so many columns."""
+    return set_cell_size(name, room) if cell_len(name) <= room else set_cell_size(name, room - 1) + "…"
+
+
+def _wrapped(text: str, width: int) -> list[str]:
+    """Words in lines of at most so many columns; a word that is longer is broken."""
+    lines: list[str] = []
+    for line in textwrap.wrap(visible(text), width) or [""]:
+        while cell_len(line) > width:  # wide letters, which textwrap counts as one
+            head = line
+            while cell_len(head) > width:
+                head = head[:-1]
+            lines.append(head)
+            line = line[len(head) :]
+        lines.append(line)
+    return lines
