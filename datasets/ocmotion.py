@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from ihbench import atomic
 from ihbench.body import Body
-from ihbench.camera import Camera
+from ihbench.camera import Camera, off_orthogonal
 from ihbench.datasets.capture_folder import BY_OPTIONS, CaptureFolder
 from ihbench.datasets.pickles import write_pickle
 from ihbench.datasets.plausibility import Outline, examine
@@ -429,7 +429,7 @@ def check_calibration(K: Array, E: Array, where: str) -> None:
     if K[0, 0] <= 0 or K[1, 1] <= 0 or np.abs(K[2] - [0, 0, 1]).max() > 1e-6 or abs(K[1, 0]) > 1e-6:
         raise BadInput(f"{where}: expected intrinsics [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] px, found another matrix")
     R = E[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0 or np.abs(E[3] - [0, 0, 0, 1]).max() > 1e-6:
+    if off_orthogonal(R) > 1e-3 or np.linalg.det(R) < 0 or np.abs(E[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise BadInput(f"{where}: expected extrinsics [[R, t], [0, 1]] with a rotation R, found another matrix")
     if np.linalg.norm(E[:3, 3]) > FARTHEST:
         raise BadInput(

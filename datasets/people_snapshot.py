@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from ihbench import atomic
 from ihbench.body import Body
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
-from ihbench.camera import Camera
+from ihbench.camera import Camera, off_orthogonal
 from ihbench.datasets.capture_folder import BY_OPTIONS, CaptureFolder
 from ihbench.datasets.pickles import write_pickle
 from ihbench.datasets.plausibility import Outline, examine, share_inside
@@ -367,7 +367,7 @@ def rigid_extrinsic(extrinsic: NDArray, path: Path) -> tuple[NDArray[np.float64]
     if not np.isfinite(extrinsic).all():
         raise BadInput(f"{path}: NaN or infinity in 'extrinsic'; expected finite numbers, copy the file again")
     R = extrinsic[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
+    if off_orthogonal(R) > 1e-3 or np.linalg.det(R) < 0:
         raise BadInput(f"{path}: expected a rotation (right-handed, no scale) in 'extrinsic', found another matrix")
     return R, extrinsic[:3, 3]
 
@@ -418,7 +418,8 @@ def _read_dataset(
 ) -> NDArray[np.float64]:
     dataset = _dataset(file, name, shape, path)
     try:
-        return np.asarray(dataset[()], np.float64)
+        with np.errstate(invalid="ignore"):  # NaN of other kinds; whoever asks looks for NaN
+            return np.asarray(dataset[()], np.float64)
     except (OSError, RuntimeError, ValueError, MemoryError) as error:
         raise _damaged(path, error) from error
 

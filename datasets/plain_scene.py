@@ -29,7 +29,7 @@ from ihbench import atomic
 from ihbench.body import Body, from_zju_root, load_body, write_body, zju_root
 from ihbench.body.skeleton import pose_hint
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
-from ihbench.camera import Camera
+from ihbench.camera import Camera, off_orthogonal
 from ihbench.datasets.capture_folder import CaptureFolder
 from ihbench.datasets.plausibility import Outline, examine
 from ihbench.datasets.standin_mark import STANDIN_FILE
@@ -298,7 +298,7 @@ def _camera(name: str, entry: Any, path: Path) -> Camera:
     K, R, t = (_numbers(entry, key, shape, where) for key, shape in (("K", (3, 3)), ("R", (3, 3)), ("t", (3,))))
     if K[0, 0] <= 0 or K[1, 1] <= 0 or K[1, 0] != 0 or not np.array_equal(K[2], [0, 0, 1]):
         raise BadInput(f"{where}: K: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0; check the signs")
-    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3:
+    if off_orthogonal(R) > 1e-3:
         raise BadInput(f"{where}: R: expected a rotation matrix (R Rᵀ = 1), found another; leave scale and t out")
     if np.linalg.det(R) < 0:
         raise BadInput(f"{where}: R: expected a rotation, found a reflection (a left-handed world); flip one axis")

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from ihbench import atomic
 from ihbench.body import Body, from_zju_root, zju_root
-from ihbench.camera import Camera
+from ihbench.camera import Camera, off_orthogonal
 from ihbench.datasets.capture_folder import BY_OPTIONS, CaptureFolder
 from ihbench.datasets.pickles import write_object
 from ihbench.datasets.plausibility import Outline, examine
@@ -280,8 +280,7 @@ def _camera_field(cams: dict, key: str, path: Path) -> NDArray[np.float64]:
 
 def _check_calibration(cameras: dict[str, NDArray[np.float64]], path: Path) -> None:
     R = cameras["R"]
-    off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max((1, 2))
-    bad = np.flatnonzero((off > 1e-3) | (np.linalg.det(R) < 0))
+    bad = np.flatnonzero((off_orthogonal(R) > 1e-3) | (np.linalg.det(np.clip(R, -1e3, 1e3)) < 0))
     if len(bad):
         raise BadInput(f"{path}: expected rotation matrices in cams['R'], found another matrix for camera {bad[0]}")
     furthest = np.linalg.norm(cameras["T"], axis=1).max()

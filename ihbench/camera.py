@@ -176,9 +176,15 @@ def check_intrinsics(K: Array, what: str = "camera K") -> None:
         raise BadValue(f"{what}: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0; {word}")
 
 
+def off_orthogonal(R: Array) -> Array:
+    """[...] largest entry of |R Rᵀ - 1| of [..., 3, 3]. Of a rotation all entries are small: huge ones may be cut."""
+    R = np.clip(R, -1e3, 1e3)
+    return np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max((-2, -1))
+
+
 def check_rotation(R: Array, what: str = "camera R", tolerance: float = 1e-2) -> None:
     """Raise `ValueError` unless [..., 3, 3] are rotations; calibrations written with two decimals still are."""
-    if (np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)) > tolerance).any():
+    if (off_orthogonal(R) > tolerance).any():
         raise BadValue(f"{what}: expected rotations (R Rᵀ = 1), got another matrix; leave scale and t out")
     if (np.linalg.det(R) < 0).any():
         raise BadValue(f"{what}: expected rotations, got a reflection (a left-handed world); flip one axis")

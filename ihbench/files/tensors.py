@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,9 @@ def read_tensors(path: str | Path) -> dict[str, Any]:
 
     with opened(path, "a file of torch.save") as file:
         try:
-            content = torch.load(file, map_location="cpu", weights_only=True)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of old protocols, and of damaged ones
+                content = torch.load(file, map_location="cpu", weights_only=True)
         except Exception as error:  # a broken or hostile file can fail in any way
             reason = " ".join(str(error).split())[:120] or type(error).__name__
             raise BadInput(

@@ -4,7 +4,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from ihbench.camera import Camera, look_at
+from ihbench.camera import Camera, look_at, off_orthogonal
 from ihbench.errors import BadInput
 
 DISTORTION = np.array([-0.12, 0.06, 1e-3, -8e-4, 0.01])
@@ -136,3 +136,8 @@ def test_an_opencv_calibration_that_cannot_be_kept_is_refused(change, word):
         Camera.from_opencv(**{**OPENCV, "t": np.zeros(3), "width": 60, "height": 50, **change})
     assert isinstance(error.value, ValueError)
     assert "\n" not in str(error.value)
+
+
+def test_a_matrix_whose_square_overflows_is_no_rotation():
+    turned = np.stack([np.eye(3), np.full((3, 3), 1e300), -np.full((3, 3), 1e300)])
+    assert (off_orthogonal(turned) < 1e-9).tolist() == [True, False, False]
