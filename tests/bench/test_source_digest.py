@@ -25,17 +25,7 @@ from tests.bench.test_house import imports
 ROOT = Path(__file__).resolve().parents[2]
 ROOMS = ("ihbench", *registry.ROOMS)
 # of what is left out, the modules that code with numbers may use: they say, find, measure or show
-HARMLESS = {
-    "failures",
-    "streams",
-    "errors",
-    "registry",
-    "progress",
-    "machine",
-    "threads",
-    "provenance",
-    "contact_sheet",
-}
+HARMLESS = {*"api failures streams errors registry progress machine threads provenance contact_sheet".split()}
 
 OF_THE_BENCH = [
     *("ihbench/render/splat.py", "ihbench/render/splat_numba.py", "ihbench/render/zbuffer.py"),
@@ -68,9 +58,13 @@ def checkout(whole_copy, monkeypatch):
     source = registry.source
     monkeypatch.setattr(source_digest, "BENCH", whole_copy / "ihbench")
     monkeypatch.setattr(source_digest, "_known", dict(source_digest._known))
-    monkeypatch.setattr(
-        registry, "source", lambda kind, name: whole_copy / source(kind, name).resolve().relative_to(ROOT)
-    )
+    monkeypatch.setattr(registry, "room", lambda name: whole_copy / name)
+
+    def moved(kind, name):
+        path = source(kind, name).resolve()
+        return path if path.is_relative_to(whole_copy) else whole_copy / path.relative_to(ROOT)
+
+    monkeypatch.setattr(registry, "source", moved)
     return whole_copy
 
 
@@ -245,7 +239,6 @@ def test_a_method_of_others_that_is_built_on_ours_counts_ours(checkout, tmp_path
     }
     monkeypatch.setattr(registry, "_found", lambda k: found(k) | ({"theirs": points[k]} if k in points else {}))
     monkeypatch.setattr(registry, "source", lambda kind, name: package if name == "theirs" else source(kind, name))
-    monkeypatch.setattr(registry, "room", lambda name: checkout / name)
     before = code_of(load_protocol("zju_occ"), "theirs")
     stage = checkout / "methods" / "inpainthuman" / "stage1.py"
     text = stage.read_text()
