@@ -23,8 +23,9 @@ BORDER = re.compile(r"\x1b\[[0-9;]*m|[│╰╯─]")  # and colours of the box 
 RULE = re.compile(r"\W*[─-]{3}[\W]*")
 UNION = re.compile(r"no type matching .* Got errors: .*- <class '[\w.]+'>: (?!\[.*\] does not match)")
 TUPLE = re.compile(
-    r"Could not find valid parse for arguments: \[(.*?)\]; Argument helptext: (--\S+ \[?(INT|FLOAT)\b)"
+    r"Could not find valid parse for arguments: (\[.*?\]); (Argument helptext: \S+ \[?(INT|FLOAT|STR|PATH))\b"
 )
+KINDS = {"STR": "plain text", "PATH": "possible paths"}  # what else is told of: numbers
 SHELLS = ("bash", "zsh", "tcsh")
 
 
@@ -116,4 +117,10 @@ def _in_one_line(box: str) -> str:
     words = "".join("\n" if RULE.fullmatch(line) else f"{line} " for line in box.splitlines()[1:])
     parts = [" ".join(BORDER.sub("", part).split()).rstrip(".") for part in words.splitlines()]
     line = "; ".join(part for part in parts if part and not part.startswith("For full helptext"))
-    return TUPLE.sub(r"\1: expected numbers in digits 0 to 9, such as 12; \2", UNION.sub("", line))
+    return TUPLE.sub(_of_several, UNION.sub("", line))
+
+
+def _of_several(found: re.Match[str]) -> str:
+    """What is wrong with one of several values: tyro itself says only that something is."""
+    wanted = KINDS.get(found[3], "numbers in digits 0 to 9, such as 12")
+    return f"{found[1].strip('[]')}: expected {wanted}; {found[2]}"

@@ -21,6 +21,7 @@ class Inner:
 class Some:
     count: Annotated[int, Within(1, 99), MultipleOf(3)] = 3
     shares: Annotated[tuple[float, ...], Within(0, 1)] = ()
+    names: tuple[str, ...] = ()
     most: Annotated[int | None, Within(1, 9)] = None
     free: float = 0.0
     whole: int = 0
@@ -52,6 +53,7 @@ class Some:
         ("--free 1e999", "--free"),
         ("--shares 0.5 1.5", "--shares 0.5 1.5: expected 0 to 1"),
         ("--shares ٠", "expected numbers in digits 0 to 9"),
+        ("--names \udcff", "expected plain text"),
         ("--most 0", "--most 0: expected 1 to 9"),
         ("--inner.rate 0", "--inner.rate 0.0: expected above 0, at most 1"),
         ("--name=", "--name '': expected a name"),
@@ -80,7 +82,7 @@ def test_good_words_are_read(monkeypatch, tmp_path):
     monkeypatch.setenv("HOME", str(tmp_path))
     words = "--count 99 --shares 0 1 .5 2e-3 --most None --free -1.5e3 --whole -7 --name ä --file ~/x --inner.rate 1"
     read = options(Some, words.split(), "x", "")
-    assert read == Some(99, (0, 1, 0.5, 0.002), None, -1500, -7, "ä", "", "a", tmp_path / "x", Inner(1))
+    assert read == Some(99, (0, 1, 0.5, 0.002), (), None, -1500, -7, "ä", "", "a", tmp_path / "x", Inner(1))
     check(read)
 
 
