@@ -25,7 +25,20 @@ from tests.bench.test_house import imports
 ROOT = Path(__file__).resolve().parents[2]
 ROOMS = ("ihbench", *registry.ROOMS)
 # of what is left out, the modules that code with numbers may use: they say, find, measure or show
-HARMLESS = {*"api failures streams errors registry progress machine threads provenance contact_sheet".split()}
+HARMLESS = {
+    *[
+        "api",
+        "failures",
+        "streams",
+        "errors",
+        "registry",
+        "progress",
+        "machine",
+        "threads",
+        "provenance",
+        "contact_sheet",
+    ]
+}
 
 OF_THE_BENCH = [
     *("ihbench/render/splat.py", "ihbench/render/splat_numba.py", "ihbench/render/zbuffer.py"),
