@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 from pathlib import Path
@@ -36,7 +37,13 @@ def user_path(words: str | os.PathLike[str], what: str = "path") -> Path:
             raise BadInput(f"{what} {text}: the variable {unset[0]} is not set; set it, or write the path in full")
     path = Path(text)
     try:
-        return path.expanduser()
+        path = path.expanduser()
+        path.stat()
+        return path
+    except OSError as error:
+        if error.errno == errno.ELOOP:  # pathlib itself raises what nobody expects
+            raise BadInput(f"{what} {text}: links that lead in a circle; name the file or folder itself") from error
+        return path
     except RuntimeError as error:
         user = path.parts[0].removeprefix("~")
         if user:

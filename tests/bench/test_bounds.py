@@ -65,17 +65,19 @@ class Some:
         (f"--file {'x' * 300}", "a name of 300 bytes"),
         (f"--file {'x/' * 3000}", "a path of 6000"),
         ("--file a\0b", "zero byte"),
+        ("--file loop", "links that lead in a circle"),
         ("--tyro-write-completion bash x", "would replace a file"),
         ("--tyro-print-completion nosh", "expected one of bash"),
     ],
 )
 def test_a_word_that_cannot_be_is_refused_by_its_option(words, told, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
+    Path("loop").symlink_to("loop")
     with pytest.raises(BadInput) as refused:
         options(Some, words.split(" "), "x", "")
     assert told in str(refused.value)
     assert words.split(" ")[0].split("=")[0] in str(refused.value)
-    assert not list(tmp_path.iterdir())
+    assert [path.name for path in tmp_path.iterdir()] == ["loop"]
 
 
 def test_good_words_are_read(monkeypatch, tmp_path):
