@@ -111,6 +111,9 @@ class Payload:
     def __reduce__(self):
         return os.mkdir, ("it-ran",)
 
+    def __repr__(self):
+        return "Payload()"
+
 
 @pytest.mark.parametrize("value", [[1], torch.zeros(2), {1: torch.zeros(2)}, {"a": Payload()}, Payload()], ids=str)
 def test_what_torch_saved_is_a_dictionary_of_tensors_or_refused(value, tmp_path, monkeypatch):
