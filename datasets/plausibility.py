@@ -112,6 +112,11 @@ class Overlap:
     outline: Outline
 
     @property
+    def in_picture(self) -> float:
+        """The share of the body's vertices that lie in the picture."""
+        return share_inside(self.view.project(self.outline.vertices), np.ones_like(self.mask))
+
+    @property
     def reach(self) -> Array | None:
         """[2] px, width and height of the projected body, also outside the picture; None where it is behind it."""
         points = self.view.project(self.outline.vertices)
@@ -178,7 +183,7 @@ def examine(
         report.problem("the masks cover whole pictures; expected 0 where the person is not")
         return
     if len(empty := [view for view, mask in masks.items() if not mask.any()]) == len(masks):
-        report.problem("the masks show no person, all are 0; expected non-zero where the person is seen")
+        report.problem("the masks show no person in any pixel; expected white where the person is seen, 0 elsewhere")
         return
     if not posed or not plausible:
         _check_masks_alone(masks, empty, whole_pictures, capture, whole, report)
@@ -439,8 +444,11 @@ def _check_images(
         repeated = [f for f in seen if f - 1 in seen and seen[f] == seen[f - 1]]
         name = "" if len(capture.camera_ids) == 1 else f" of camera {capture.camera_ids[camera]}"
         if len(seen) > 2 and len(set(seen.values())) == 1:
-            report.problem(
-                f"all {len(seen)} pictures looked at{name} are one and the same; expected a picture for each frame"
+            still = _one_pose(capture, seen)
+            reason = "right for drawings of somebody who stands still, " if still else ""
+            (report.warn if still else report.problem)(
+                f"all {len(seen)} pictures looked at{name} are one and the same; {reason}"
+                f"expected a picture for each frame"
             )
         elif repeated:
             report.warn(
@@ -476,6 +484,16 @@ def _check_softness(capture: CaptureFolder, masks: dict[tuple[int, int], Mask], 
             f"of the values above the middle {middle:.0%}: threshold the masks at 128 and write 0 and 255"
         )
         (report.problem if more > 0.1 or read > 1.5 * middle else report.warn)(text)
+
+
+def _one_pose(capture: CaptureFolder, frames: Iterable[int]) -> bool:
+    """Whether the person stands still in these frames, by the poses."""
+    try:
+        poses = [capture.body_pose(frame) for frame in frames]
+    except BadInput:  # named where poses are looked at
+        return False
+    moved = [np.ptp([part(pose) for pose in poses], axis=0).max() for part in (lambda p: p.pose, lambda p: p.transl)]
+    return max(moved) < 1e-9
 
 
 def _check_masks_alone(
@@ -611,8 +629,10 @@ def _check_fit(
     visible = [fit for fit in fits if fit.area > 0]
     if not visible:
         return
-    if whole is False and (empty := [(fit.camera, fit.frame) for fit in fits if fit.area == 0]):
-        report.warn(f"{len(empty)} of {len(fits)} masks looked at are empty ({_views(capture, empty)})")
+    empty = [(fit.camera, fit.frame) for fit in fits if fit.area == 0 and (fit.body_area > 0.005 or whole is False)]
+    are_empty = f"{len(empty)} of {len(fits)} masks looked at are empty ({_views(capture, empty)})"
+    if empty and whole is False:
+        report.warn(are_empty)
     inside = found["vertices_in_mask"] = round(float(np.mean([fit.vertices_in_mask for fit in visible])), 4)
     covered = found["mask_on_body"] = round(float(np.mean([fit.mask_on_body for fit in visible])), 4)
     low = [fit for fit in visible if len(fit.iou) > 1]
@@ -628,6 +648,10 @@ def _check_fit(
         return
     if _check_single_views(capture, fits, whole, report):
         return
+    if empty and whole is True:
+        report.problem(f"{are_empty}; make these masks anew or leave the frames out")
+    elif empty and whole is None:
+        report.warn(f"{are_empty}; right only where something hides the whole person")
     lowest_covered, lowest_inside = (0.75, 0.85) if exact else (0.5, 0.7)
     bad = covered < lowest_covered or (whole is True and inside < lowest_inside)
     odd = exact and (covered < 0.9 or (whole is True and inside < 0.95))
@@ -637,7 +661,7 @@ def _check_fit(
         bad |= gain > CERTAIN
     elif bad or odd:
         text = _unlike(visible, covered, inside)
-    elif whole is not True and inside < 0.3:
+    elif whole is not True and inside < 0.3 * float(np.mean([fit.in_picture for fit in visible])):
         text = "right only if something hides the rest"
     else:
         return

@@ -184,7 +184,15 @@ def test_what_no_sound_scene_has(name, scene, tmp_path):
     assert all("\n" not in line and "nan" not in line for line in problems)
 
 
+def a_statue(folder):
+    for kind in ("images", "masks"):
+        order(kind, [0] * FRAMES)(folder)
+    poses(pose=lambda p: np.repeat(p[:1], FRAMES, 0), transl=lambda t: np.repeat(t[:1], FRAMES, 0))(folder)
+
+
 WARNINGS = {
+    "a statue": (a_statue, "right for drawings of somebody who stands still"),
+    "most empty": (masks(lambda m: 0 * m, range(3, FRAMES)), "masks looked at are empty (frames 3, 4,"),
     "only heads": (masks(lambda m: np.where(ROWS < 36, m, 0).astype("u1")), "something hides"),
     "a little loose": (masks(lambda m: np.array(Image.fromarray(m).filter(ImageFilter.MaxFilter(9)))), "the body is"),
     "every other picture": (
