@@ -77,8 +77,18 @@ def _system_error(error: OSError) -> Failure | None:
             return None
         text = f"standard output cannot be written ({system_words(error)}); send it elsewhere"
         return Failure(2, "output failed", text)
+    if error.errno == errno.ENOENT and _is_homeless():
+        return Failure(2, "system error", "the current folder has been removed; go to another one, then run it again")
     text = f"{system_words(error)}; check that path, its permissions and the disk, then run the same command again"
     return Failure(2, "system error", text)
+
+
+def _is_homeless() -> bool:
+    try:
+        os.getcwd()
+    except OSError:
+        return True
+    return False
 
 
 def _named(error: BaseException) -> str:

@@ -23,7 +23,7 @@ from ihbench import __version__, removal
 from ihbench.errors import BadInput
 from ihbench.metrics import Mean
 from ihbench.results import RunResult, read_result, without_copies
-from ihbench.store import KILLED, OUR_NAME
+from ihbench.store import INDEX, KILLED, OUR_NAME
 
 UNREADABLE = "unreadable"
 FILTERS = ("protocol", "scene", "method", "profile", "seed", "status")
@@ -89,7 +89,7 @@ class Index:
 
     def __init__(self, runs: Path) -> None:
         self.runs = Path(runs)
-        self.file = self.runs / "runs.sqlite"
+        self.file = self.runs / INDEX
 
     def query(self, **filters: Any) -> list[dict[str, Any]]:
         """What the folders are, oldest first: id, path, protocol, scene, method, profile, seed, status ("unreadable"

@@ -33,6 +33,7 @@ REDONE = "redone"  # fit time that a kill threw away
 CRC_BLANK = b'"payload_crc32":"00000000"'
 SAVE_SHARE = 0.05  # of the time may go into saving states
 STAGE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.+-]*(/[A-Za-z0-9][A-Za-z0-9 _.+-]*)*")
+LARGEST_HEADER = 2**26  # bytes of a saved state's header, events and all
 STATE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,99}")
 
 OnCheckpoint = Callable[[int, float, Any], None]
@@ -233,7 +234,7 @@ class Ledger:
             if self.folder is None:
                 self._in_memory[name] = _copies(tensors), {"meta": encode(dict(meta)), "clock": self._clocks()}
             else:
-                events = {"of": self.folder.name, "events": self.events}
+                events = {"name": name, "of": self.folder.name, "events": self.events}
                 data = _pack(tensors, {"meta": encode(dict(meta)), "clock": self._clocks(), **encode(events)})
                 write_bytes(self._state_path(name), data)
         self._last_save = self._clock()
@@ -378,6 +379,17 @@ def _root(path: str) -> str:
 def saved_meta(file: Path) -> dict[str, Any]:
     """The meta of a saved state's file. Raises `ValueError`, or what the reader raises, when it is damaged."""
     return decode(_unpack(read_bytes(file))[1]["meta"])
+
+
+def is_saved_state(file: Path) -> bool:
+    """Whether `save_state` wrote this file, under this name: a copy under another name is somebody's own."""
+    try:
+        with open(file, "rb") as stream:
+            header = json.loads(stream.read(min(int.from_bytes(stream.read(8), "little"), LARGEST_HEADER)))
+        record = json.loads(header["__metadata__"]["record"])
+        return file.suffix == ".safetensors" and record.get("name", file.stem) == file.stem
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        return False
 
 
 def _copies(tensors: Mapping[str, Any]) -> dict[str, Any]:

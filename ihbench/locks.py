@@ -223,8 +223,13 @@ def _write_owner(path: Path, how: int) -> str:
         {"process": os.getpid(), "since": _started(os.getpid()), **_here(), "hold": secrets.token_hex(4)}
     )
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | how | getattr(os, "O_NOFOLLOW", 0), 0o666)
-    with os.fdopen(descriptor, "w", encoding="utf-8") as stream:
-        stream.write(words)
+    try:
+        with os.fdopen(descriptor, "w", encoding="utf-8") as stream:
+            stream.write(words)
+    except OSError:  # a full disk: without words it would say for long that somebody holds
+        with suppress(OSError):
+            path.unlink()
+        raise
     return words
 
 

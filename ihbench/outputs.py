@@ -14,9 +14,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from ihbench import atomic
+from ihbench import atomic, removal
 from ihbench.errors import BadInput
-from ihbench.store import is_record
+from ihbench.store import INDEX, is_record
 
 LIST = ".ihbench-written.json"
 
@@ -59,11 +59,14 @@ def check(folder: Path, names: Iterable[str]) -> None:
             )
 
 
-def check_file(path: Path | None) -> None:
+def check_file(path: Path | None, *sources: Path | None) -> None:
     """Raise `BadInput` where a file that the user names to be written is a part of a run, a training set or a
-    stand-in. None is fine."""
-    if path is None or not os.path.lexists(path):
+    stand-in, or one of `sources`, which the command reads, or in them. None is fine."""
+    if path is None or not os.path.lexists(path) or atomic.is_stream(path):
         return
+    for source in sources:
+        if source is not None and removal.holds(source, path):
+            raise BadInput(f"{path}: is a part of {source}, which is only read; name another file")
     where = Path(os.path.realpath(path))
     for folder in list(where.parents)[:4]:
         if _is_part(folder, where.relative_to(folder)):
@@ -72,6 +75,8 @@ def check_file(path: Path | None) -> None:
 
 def _is_part(folder: Path, file: Path) -> bool:
     if os.path.isfile(folder / "run.json") and is_record(file):
+        return True
+    if file.as_posix() == INDEX:
         return True
     for name, list_of in (("manifest.json", "files"), ("STANDIN.json", None)):
         if not os.path.isfile(folder / name):

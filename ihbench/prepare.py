@@ -172,9 +172,13 @@ def _written_there(folder: Path) -> removal.Ours:
     if not isinstance(files, dict) or not str(manifest.get("made_by", "")).startswith("ihbench "):
         raise BadInput(f"its {MANIFEST} is not one of ours")
 
+    folders = {parent for file in files for parent in Path(file).parents}
+
     def ours(file: Path) -> bool:
         if file.as_posix() == MANIFEST:
             return True
+        if (folder / file).is_dir():
+            return file in folders
         sha = files.get(file.as_posix())
         return sha is not None and sha == hashlib.sha256((folder / file).read_bytes()).hexdigest()
 

@@ -114,6 +114,7 @@ class About(TypedDict):
     predictions: NotRequired[PredictionFiles]
     changed: NotRequired[list[str]]
     left_out: NotRequired[list[Omission]]
+    avatar_files: NotRequired[list[str]]
     fit_seconds: NotRequired[Seconds | None]
     total_seconds: NotRequired[Seconds]
     peak_mb: NotRequired[Megabytes]

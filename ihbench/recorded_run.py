@@ -6,18 +6,20 @@ import gc
 import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from ihbench import atomic, machine, removal
 from ihbench.errors import BadInput, Diverged
+from ihbench.failures import one_line
 from ihbench.interruption import interruptible, reason_of, undisturbed
 from ihbench.ledger import Ledger, OnCheckpoint
 from ihbench.progress import Progress
 from ihbench.protocol import Protocol
 from ihbench.results import TRACEBACK, RunResult, read_result
 from ihbench.scene import Capture
-from ihbench.store import RunFolder, RunIdentity
+from ihbench.store import RunFolder, RunIdentity, note_interruption
 
 
 class RecordedRun(ABC):
@@ -101,21 +103,35 @@ def recorded(
     A finished one is found in places that may not be written, too.
     """
     with interruptible():
-        folder = RunFolder.create(runs, identity, about, force)
-        if folder.finished:
+        try:
+            folder = RunFolder.create(runs, identity, about, force)
+            if not folder.finished:
+                _begun(folder, make)
             return read_result(folder.path)
-        with folder.lock():
-            if not folder.finished:  # a rival may have been quicker
-                gc.collect()  # what an earlier run in this process left in cycles is not this run's memory
-                machine.reset_peak_memory()
-                keep = False
-                try:
-                    make(folder).guarded()
-                    keep = True
-                finally:
-                    with undisturbed():
-                        folder.settle(keep)
-        return read_result(folder.path)
+        except KeyboardInterrupt as stop:
+            with undisturbed():  # it may have come before the run was guarded
+                note_interruption(Path(runs) / identity.folder_name, reason_of(stop))
+            raise
+
+
+def _begun(folder: RunFolder, make: Callable[[RunFolder], RecordedRun]) -> None:
+    with folder.lock():
+        if folder.finished:  # a rival was quicker
+            return
+        gc.collect()  # what an earlier run in this process left in cycles is not this run's memory
+        machine.reset_peak_memory()
+        keep = False
+        try:
+            make(folder).guarded()
+            keep = True
+        except Exception as error:
+            if folder.status == "running":  # it came before the run was guarded
+                with suppress(BadInput, OSError):
+                    folder.set_status("failed", one_line(str(error)) or type(error).__name__)
+            raise
+        finally:
+            with undisturbed():
+                folder.settle(keep)
 
 
 def about_scene(capture: Capture, protocol: Protocol) -> dict[str, Any]:

@@ -55,9 +55,12 @@ def move_written(source: Path, target: Path, ours: Ours, last: str) -> None:
 
 
 def foreign(folder: Path, ours: Ours) -> Path | None:
-    """The first thing below `folder` that the bench did not write there, a link for instance, or None."""
+    """The first thing below `folder` that the bench did not write there, a link or an empty folder for instance, or
+    None."""
     for path, kind in _walk(folder):
-        if kind != "folder" and (kind == "link" or not ours(path.relative_to(folder))):
+        if kind == "folder" and any(os.scandir(path)):
+            continue
+        if kind == "link" or not ours(path.relative_to(folder)):
             return path
     return None
 

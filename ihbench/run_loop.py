@@ -196,7 +196,7 @@ class _Run(RecordedRun):
             avatar = method.fit(
                 training, device=request.device, seed=request.seed, ledger=self.ledger, progress=self.progress
             )
-        with self.ledger.stage("save"):
+        with self.ledger.stage("save"), self.folder.saving_avatar():
             avatar.save(self.folder.path / "avatar")
         self.folder.set_status("running", ledger=self.ledger)
         with self.ledger.stage("score"):

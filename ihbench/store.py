@@ -26,7 +26,8 @@ from typing import Any, get_args
 
 from ihbench import atomic, locks, machine, removal
 from ihbench.errors import BadInput
-from ihbench.ledger import Ledger
+from ihbench.interruption import undisturbed
+from ihbench.ledger import Ledger, is_saved_state
 from ihbench.provenance import provenance
 from ihbench.record import Status, curve_points, read_json, record_fault, score_lines
 
@@ -36,6 +37,8 @@ FINISHED = ("done", "diverged", "skipped")  # running such a run again would end
 HASH_LENGTH = 10
 OUR_NAME = re.compile(f"__[0-9a-f]{{{HASH_LENGTH}}}$")  # of a run folder, even of one that has lost its record
 LOCK = "lock"
+INDEX = "runs.sqlite"  # beside the run folders
+DAMAGED_NAME = re.compile(r"run\.json\.damaged(-\d+)?")
 KILLED = "its process ended without a word: it was killed, or the machine went down"
 # what the bench writes into a run folder: whatever else lies there is the user's, and stays
 WRITTEN = {
@@ -115,9 +118,20 @@ class RunFolder:
         when the folder cannot be written, belongs to another run, or to a newer version of this bench.
         """
         path = Path(runs) / identity.folder_name
-        if force:
+        if not force:
+            return cls._there(path, identity, about)
+        try:
             with _locked(path), _movable(path):
                 _set_aside(path)
+            return cls._there(path, identity, about)
+        except BaseException:
+            with undisturbed(), suppress(BadInput), _locked(path), _movable(path):
+                _bring_back(path)
+            raise
+
+    @classmethod
+    def _there(cls, path: Path, identity: RunIdentity, about: Mapping[str, Any] | None) -> RunFolder:
+        """The run as `create` finds or begins it."""
         warnings = []
         if (path / "run.json").exists():
             try:
@@ -233,6 +247,21 @@ class RunFolder:
         self.record["provenance"], self.record["machine"] = provenance(), machine.identity()
         self.set_status("running")
 
+    @contextmanager
+    def saving_avatar(self) -> Iterator[None]:
+        """Note in the record which files are written into the folder `avatar` meanwhile: the method names them."""
+
+        def state() -> dict[str, tuple[int, ...]]:
+            files = [path for path in (self.path / "avatar").rglob("*") if path.is_file() and not path.is_symlink()]
+            about = {path.relative_to(self.path).as_posix(): path.stat() for path in files}
+            return {name: (stat.st_ino, stat.st_size, stat.st_mtime_ns) for name, stat in about.items()}
+
+        before = state()
+        yield
+        known = self.record["about"].get("avatar_files", [])
+        changed = [name for name, stat in state().items() if before.get(name) != stat]
+        self.record["about"]["avatar_files"] = sorted({*known, *changed})
+
     def write_scores(self, rows: list[Record]) -> None:
         """Replace scores.jsonl: one row for each test view."""
         atomic.write_json_lines(self.path / "scores.jsonl", rows)
@@ -253,15 +282,13 @@ class RunFolder:
     def settle(self, keep_new: bool) -> None:
         """End a forced run: forget the finished run it replaces, or bring that one back. Call it inside `lock()`."""
         old = _aside(self.path)
-        if not old.is_dir():
-            return
         with _movable(self.path):
             if not keep_new:
-                removal.remove_written(self.path, _is_ours)
-                removal.move_written(old, self.path, _is_ours, "run.json")
-            removal.remove_written(old, _is_ours)
-        with suppress(OSError):  # it holds something that is not ours
-            old.rmdir()
+                _bring_back(self.path)
+            elif old.is_dir():
+                removal.remove_written(old, _written_in(old))
+                with suppress(OSError):  # it holds something that is not ours
+                    old.rmdir()
 
     @contextmanager
     def lock(self) -> Iterator[None]:
@@ -281,6 +308,18 @@ def is_finished(runs: Path, identity: RunIdentity) -> bool:
         return RunFolder.open(Path(runs) / identity.folder_name).finished
     except (BadInput, OSError):
         return False
+
+
+def note_interruption(path: Path, reason: str) -> None:
+    """Of a run whose record says that it is running, and that nobody writes, record that it was interrupted; a
+    finished one that it would have replaced is brought back."""
+    if not (path / "run.json").is_file():
+        return
+    with suppress(BadInput, OSError), locks.locked(path / LOCK, "", wait=0):
+        _bring_back(path)
+        run = RunFolder.open(path)
+        if run.status == "running":
+            run.set_status("interrupted", reason)
 
 
 class DamagedRecord(BadInput):
@@ -349,9 +388,9 @@ def _set_aside(path: Path) -> None:
     except BadInput:
         finished = False
     if finished:
-        removal.move_written(path, old, _is_ours, "run.json")
+        removal.move_written(path, old, _written_in(path), "run.json")
     else:
-        removal.remove_written(path, _is_ours)
+        removal.remove_written(path, _written_in(path))
 
 
 def _is_ours(path: Path) -> bool:
@@ -362,6 +401,37 @@ def _is_ours(path: Path) -> bool:
     if top == "renders" and path.suffix == ".png":
         return path.stem.isdecimal()
     return path.suffix in WRITTEN.get(top, ()) or atomic.is_stray(path.name)
+
+
+def _bring_back(path: Path) -> None:
+    """Undo `_set_aside`, as far as it came: the record goes last in both directions."""
+    old = _aside(path)
+    if not old.is_dir():
+        return
+    if (old / "run.json").exists():
+        removal.remove_written(path, _written_in(path))
+    removal.move_written(old, path, _written_in(old), "run.json")
+    with suppress(OSError):  # it holds something that is not ours
+        old.rmdir()
+
+
+def _written_in(folder: Path) -> removal.Ours:
+    """`_is_ours` of one run folder. Where a method or the user chooses the name, the record or the file itself says
+    who wrote it."""
+    try:
+        avatar = RunFolder.open(folder).record["about"].get("avatar_files")
+    except BadInput:
+        avatar = None  # as of a run of version 0.1: all that has such a name
+
+    def ours(path: Path) -> bool:
+        if len(path.parts) > 1 and not atomic.is_stray(path.name):
+            if path.parts[0] == "avatar" and avatar is not None and not (folder / path).is_dir():
+                return path.as_posix() in avatar
+            if path.parts[0] == "checkpoints":
+                return is_saved_state(folder / path)
+        return _is_ours(path)
+
+    return ours
 
 
 def check_is_run(path: Path) -> None:
@@ -385,9 +455,9 @@ def remove_run(path: Path) -> Path | None:
     check_is_run(path)
     advice = "check its permissions"
     with locks.locked(path / LOCK, advice, wait=0), _movable(path):
-        removal.remove_written(path, lambda file: _is_ours(file) or file.name.startswith("run.json.damaged"))
-    for name in (LOCK, LOCK + locks.OWNER):
-        removal.discard_file(path / name)
+        ours = _written_in(path)
+        removal.remove_written(path, lambda file: ours(file) or DAMAGED_NAME.fullmatch(str(file)) is not None)
+        removal.discard_file(path / LOCK)  # while it is held: later it may be somebody else's
     with suppress(OSError):
         path.rmdir()
         return None
@@ -396,7 +466,7 @@ def remove_run(path: Path) -> Path | None:
 
 def is_record(path: Path) -> bool:
     """Whether what has this path in a run folder belongs to the run; an exported avatar does not."""
-    return path.name != "avatar.ply" and _is_ours(path)
+    return (path.name != "avatar.ply" and _is_ours(path)) or path.as_posix() in (LOCK, LOCK + locks.OWNER)
 
 
 def _now() -> str:

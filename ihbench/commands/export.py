@@ -41,7 +41,7 @@ def main(argv: list[str]) -> int:
     from ihbench.run_loop import load_avatar
     from ihbench.splat_ply import UPRIGHT, VIEWER_TURN, write_splat_ply
 
-    outputs.check_file(chosen.out)
+    outputs.check_file(chosen.out, chosen.data, chosen.body)
     avatar, open_capture = load_avatar(chosen.run, chosen.data, chosen.body)
     if not hasattr(avatar, "gaussians"):
         raise BadInput(f"{chosen.run}: its method has no Gaussians to export")

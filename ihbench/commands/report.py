@@ -79,7 +79,7 @@ def main(argv: list[str]) -> int:
     from ihbench.results import read_results
     from ihbench.row_choice import Choice
 
-    outputs.check_file(chosen.out)
+    outputs.check_file(chosen.out, chosen.data, chosen.body)
     write = registry.load("report", chosen.format or "md")
     only = {"fragment": True} if chosen.fragment else {}
     if only and "fragment" not in signature(write).parameters:

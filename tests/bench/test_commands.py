@@ -274,6 +274,14 @@ def test_data_check_does_without_a_picture_where_none_may_be_written(bench, tmp_
         outcome = bench("data", "check", copy)
         assert outcome.status == 0, outcome
         assert f"overlay: none: {reason}" in outcome.out
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    outcome = bench("data", "check", copy)
+    assert (outcome.status, "overlay: none: the current folder is gone" in outcome.out) == (0, True), outcome
+    outcome = bench("data", "check", ".")
+    assert (outcome.status, outcome.err.count("\n")) == (2, 1)
+    monkeypatch.chdir(tmp_path)
     assert contents(copy) == before
     monkeypatch.setenv("SOMEWHERE", str(tmp_path))
     assert bench("data", "check", "$SOMEWHERE/copy/", "--overlays", tmp_path / "seen").status == 0

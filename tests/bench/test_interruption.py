@@ -15,12 +15,13 @@ import pytest
 
 from ihbench import interruption
 from ihbench.atomic import read_json
+from ihbench.errors import BadInput
 from ihbench.index import Index
 from ihbench.interruption import Terminated, interruptible, undisturbed
 from ihbench.progress import Progress
 from ihbench.recorded_run import RecordedRun, recorded
 from ihbench.results import read_result
-from ihbench.store import KILLED
+from ihbench.store import KILLED, RunFolder
 from tests.bench.test_store import IDENTITY
 
 # a run that waits for its end, as `ihbench run` makes one
@@ -114,6 +115,40 @@ def test_a_run_asked_to_end_records_that_and_the_status_says_by_what(tmp_path, n
     record = only_record(tmp_path)
     assert record["status"] == "interrupted"
     assert record["reason"] == ("interrupted by the user" if name == "SIGINT" else f"interrupted by {name}")
+
+
+@pytest.mark.parametrize("before", ["", "running", "done"])
+@pytest.mark.parametrize("where", ["save", "lock", "make"])
+@pytest.mark.parametrize("error", [Terminated(signal.SIGTERM), BadInput("disk full")])
+def test_what_ends_a_run_before_its_work_begins_is_recorded_too(tmp_path, monkeypatch, before, where, error):
+    """Between the first record and the guarded work lie the lock, its wait, and what makes the run ready. A finished
+    run that a forced one would have replaced is there again."""
+    if before:
+        (RunFolder.create(tmp_path, IDENTITY).path / "scores.jsonl").write_text(before)
+        RunFolder.create(tmp_path, IDENTITY).set_status(before)
+
+    def ends(*words):
+        raise error
+
+    if where != "make":
+        monkeypatch.setattr(RunFolder, where, ends)
+    with pytest.raises(type(error)):
+        recorded(tmp_path, IDENTITY, {}, before == "done", ends)
+    monkeypatch.undo()
+    stopped = isinstance(error, Terminated)
+    if before == "done" and (stopped or where != "lock"):  # somebody else's hold of the lock leaves all to them
+        (scores,) = tmp_path.glob("*/scores.jsonl")
+        assert (only_record(tmp_path)["status"], scores.read_text()) == ("done", "done")
+        assert not list((tmp_path / "replaced").glob("*"))
+    elif (before, where) == ("", "save"):
+        assert not list(tmp_path.rglob("run.json"))
+    else:
+        outcome = {
+            "make": ("interrupted", "interrupted by SIGTERM") if stopped else ("failed", "disk full"),
+            "lock": ("interrupted", "interrupted by SIGTERM") if stopped else ("running", ""),
+            "save": ("running", ""),
+        }
+        assert (only_record(tmp_path)["status"], only_record(tmp_path)["reason"]) == outcome[where]
 
 
 def test_a_hang_up_that_nohup_ignores_stays_ignored(tmp_path):

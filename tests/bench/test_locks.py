@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import nullcontext
 
 import pytest
 
@@ -214,3 +215,28 @@ def test_a_lock_never_writes_through_a_link(file, tmp_path):
     with locked(file, ""):
         pass
     assert (tmp_path / "precious").read_text() == "x"
+
+
+def test_a_disk_that_is_full_leaves_no_claim_of_nobody(file, kind, monkeypatch):
+    fdopen = os.fdopen
+
+    class Full:
+        def __init__(self, descriptor, *how, **more):
+            self.stream = fdopen(descriptor, *how, **more)
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *error):
+            self.stream.close()
+
+        def write(self, words):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fdopen", Full)
+    with pytest.raises(BadInput) if kind else nullcontext(), locked(file, ""):  # the system's lock needs no name
+        pass
+    monkeypatch.undo()
+    assert not file.with_name(file.name + locks.OWNER).exists()
+    with locked(file, "", wait=0):
+        pass

@@ -106,7 +106,8 @@ def test_long_work_does_not_begin_where_it_could_not_be_written(tmp_path, monkey
 def test_a_report_does_not_take_the_place_of_what_it_reads(bench_with_run, tmp_path):
     (run,) = bench_with_run.folders()
     before = contents(run)
-    parts = ["run.json", "scores.jsonl", "avatar/avatar.safetensors", "contact_sheet.png"]
+    parts = ["run.json", "scores.jsonl", "avatar/avatar.safetensors", "contact_sheet.png", "lock", "../runs.sqlite"]
+    assert bench_with_run("runs", "list", "--runs", bench_with_run.runs).status == 0
     (tmp_path / "link").symlink_to(run / "run.json")
     for path in (*(run / part for part in parts), tmp_path / "link"):
         for words in (["report", run], ["report", "table1", "--runs", bench_with_run.runs], ["export", run]):
@@ -137,3 +138,5 @@ def test_parts_of_training_sets_and_stand_ins(tmp_path):
     for name in ("set/mine.md", "site/report.md", "site/new.md", "none/new.md"):
         outputs.check_file(tmp_path / name)
     outputs.check_file(None)
+    with pytest.raises(BadInput, match="which is only read"):
+        outputs.check_file(tmp_path / "site" / "report.md", None, tmp_path / "site")

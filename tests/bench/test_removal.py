@@ -8,11 +8,13 @@ import os
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from ihbench import locks, removal, store
 from ihbench.cli import main
 from ihbench.errors import BadInput
+from ihbench.ledger import Ledger
 from ihbench.prepare import prepare
 from ihbench.progress import Progress
 from ihbench.store import RunFolder
@@ -69,7 +71,10 @@ def handed(scene, out, force=False, sources=()):
 def test_force_replaces_what_it_wrote_and_leaves_nothing_beside(scene, tmp_path):
     folder = handed(scene, tmp_path)
     before = contents(tmp_path)
-    (folder / "test_views.json").unlink()  # a file that is missing is nobody's loss
+    (folder / "test_views.json").unlink()  # files that are missing are nobody's loss
+    masks = next(folder.rglob("masks"))
+    shutil.rmtree(masks)
+    masks.mkdir()
     assert handed(scene, tmp_path, force=True) == folder
     assert contents(tmp_path) == before
 
@@ -80,6 +85,10 @@ def a_stranger(folder):
 
 def an_edited_file(folder):
     (folder / "test_views.json").write_text("[]")
+
+
+def an_empty_folder(folder):
+    (folder / "images" / "mine").mkdir(parents=True)
 
 
 def a_link(folder):
@@ -106,7 +115,7 @@ def a_manifest_of_a_wrong_kind(folder):
 @pytest.mark.parametrize("force", [False, True])
 @pytest.mark.parametrize(
     "change",
-    [a_stranger, an_edited_file, a_link, no_manifest, a_foreign_manifest, a_damaged_manifest,
+    [a_stranger, an_edited_file, an_empty_folder, a_link, no_manifest, a_foreign_manifest, a_damaged_manifest,
      a_manifest_of_a_wrong_kind],
 )  # fmt: skip
 def test_a_folder_that_holds_anything_else_is_left_and_its_removal_not_proposed(scene, tmp_path, change, force):
@@ -200,7 +209,7 @@ def test_the_command_does_not_touch_the_data(bench, tmp_path):
 # ----------------------------------------------------------------------------------------------------- run folders
 
 THEIRS = ["notes.txt", "figure.png", "renders/mine.txt", "renders/1/best.png", "avatar/edited.ply", "backup/run.json"]
-OURS = ["scores.jsonl", "renders/1/000030.png", "avatar/avatar.safetensors", "checkpoints/stage1.safetensors"]
+OURS = ["scores.jsonl", "renders/1/000030.png", "avatar/avatar.safetensors"]
 
 
 @pytest.mark.parametrize("status", ["done", "interrupted"])
@@ -222,6 +231,29 @@ def test_a_forced_run_leaves_what_is_the_users(tmp_path, status, keep_new):
     assert there.keys() == {*THEIRS, *(OURS if old else OURS[:1]), "lock", "run.json"}
     assert there["scores.jsonl"] == (b"scores.jsonl" if old else b"new")
     assert not list((tmp_path / "replaced").glob("*"))
+
+
+@pytest.mark.parametrize("force", [True, False])
+@pytest.mark.parametrize("status", ["done", "interrupted"])
+def test_names_that_a_method_might_choose_are_its_own_only_where_the_run_says_so(tmp_path, force, status):
+    run = RunFolder.create(tmp_path, IDENTITY)
+    mine = ["avatar/mesh.npz", "checkpoints/mine.safetensors", "checkpoints/backup.safetensors"]
+    for name in mine:
+        (run.path / name).parent.mkdir(exist_ok=True)
+        (run.path / name).write_text("mine")
+    with run.saving_avatar():
+        (run.path / "avatar" / "avatar.npz").write_text("ours")
+    Ledger(run.path).save_state("stage1", {"x": np.zeros(3)}, {})
+    shutil.copy(run.path / "checkpoints" / "stage1.safetensors", run.path / mine[2])
+    run.set_status(status)
+    if force:
+        RunFolder.create(tmp_path, IDENTITY, force=True)
+        assert contents(run.path).keys() == {*mine, "run.json", "lock"}
+    else:
+        (run.path / "run.json.damaged").touch()
+        (run.path / "run.json.damaged-notes").write_text("mine")
+        store.remove_run(run.path)
+        assert contents(run.path).keys() == {*mine, "run.json.damaged-notes"}
 
 
 def test_a_forced_run_that_is_killed_while_it_makes_room_loses_nothing(tmp_path, monkeypatch):
