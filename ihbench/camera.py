@@ -40,17 +40,19 @@ class Camera:
                 raise BadValue(
                     f"camera {name}: expected finite values of shape {shape}, got shape {value.shape}{word}"
                 )
+            value = without_rounding(value) if name == "K" else value
             value.setflags(write=False)
             object.__setattr__(self, name, value)
         check_intrinsics(self.K)
         check_rotation(self.R)
         for name in ("width", "height"):
-            size = getattr(self, name)
-            if isinstance(size, bool) or not isinstance(size, int | np.integer) or size < 1:
+            try:
+                size = whole_pixels(getattr(self, name))
+            except BadValue:
                 raise BadValue(
                     f"camera size: expected whole numbers of pixels, at least 1×1, got {self.width!r}×{self.height!r}"
-                )
-            object.__setattr__(self, name, int(size))
+                ) from None
+            object.__setattr__(self, name, size)
 
     @classmethod
     def from_opencv(
@@ -73,6 +75,7 @@ class Camera:
         K = K[0] if K.shape == (1, 3, 3) else K
         if K.shape != (3, 3):
             word = "; give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]" if K.size == 4 else ""
+            word = "; the camera is its upper left 3×3" if K.shape in ((3, 4), (4, 4)) else word
             raise BadValue(f"camera K: expected shape [3, 3], got {list(K.shape)}{word}")
         K[:2, 2] += 0.5
         R = as_numbers(R, "camera R")
@@ -80,6 +83,9 @@ class Camera:
             R = axis_angle_to_matrix(R.reshape(3))
         elif R.shape == (1, 3, 3):
             R = R[0]
+        elif R.shape != (3, 3):
+            word = "; its last column is t, the rest R" if R.shape[-2:] in ((3, 4), (4, 4)) else ""
+            raise BadValue(f"camera R: expected [3, 3] or a rotation vector, got shape {list(R.shape)}{word}")
         t = as_numbers(t, "camera t")
         if t.size != 3:
             word = "; its last column is t, the rest R" if t.shape[-2:] in ((3, 4), (4, 4)) else ""
@@ -150,6 +156,23 @@ def as_numbers(value: Any, what: str) -> Array:
     return array
 
 
+def whole_pixels(size: Any) -> int:
+    """A width or height of any type of number, an array or tensor of one too. Raises `ValueError` unless whole."""
+    if isinstance(size, bool | np.bool_ | str):
+        raise BadValue(f"image size: expected whole numbers of pixels, got {size!r}")
+    values = as_numbers(size, "image size")
+    if values.size != 1 or values.item() < 1 or values.item() != int(values.item()):
+        raise BadValue(f"image size: expected whole numbers of pixels, at least 1, got {size!r}")
+    return int(values.item())
+
+
+def without_rounding(K: Array) -> Array:
+    """[3, 3] with the zeros and the one of a K that a factorisation left a little off."""
+    exact = np.array([[K[0, 0], K[0, 1], K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]])
+    off = np.abs(K - exact).max()
+    return exact if 0 < off <= 1e-9 * np.abs(K).max() else K
+
+
 def five_coefficients(distortion: Any) -> Array | None:
     """[5] k1 k2 p1 p2 k3 of any OpenCV distortion; None for none. Raises `ValueError` for what they cannot say."""
     if distortion is None:
@@ -173,6 +196,7 @@ def check_intrinsics(K: Array, what: str = "camera K") -> None:
     """Raise `ValueError` unless [3, 3] is [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0."""
     if K[0, 0] <= 0 or K[1, 1] <= 0 or K[1, 0] != 0 or not np.array_equal(K[2], (0, 0, 1)):
         word = "it looks transposed" if np.array_equal(K[:, 2], (0, 0, 1)) and K[2, :2].any() else "check the signs"
+        word = "divide it by its last number" if not K[2, :2].any() and K[2, 2] not in (0, 1) else word
         raise BadValue(f"{what}: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0; {word}")
 
 

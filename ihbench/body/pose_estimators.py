@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ihbench.body.root_convention import from_zju_root
 from ihbench.body.skeleton import SMPLX_SIZES, pose_hint
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
-from ihbench.camera import Camera, as_numbers, check_intrinsics, check_rotation
+from ihbench.camera import Camera, as_numbers, check_intrinsics, check_rotation, whole_pixels, without_rounding
 from ihbench.errors import BadInput
 from ihbench.scene import BodyPose
 
@@ -72,7 +72,7 @@ def from_camera_space(
     pose: Any,  # [72] or [24, 3] rad, or rotation matrices [24, 3, 3]; root in the camera's frame
     betas: Any,  # [B]
     transl: Any,  # [3] m, in the camera's frame
-    K: Any,  # [3, 3] px, or a focal length: then the principal point is the image's centre
+    K: Any,  # [3, 3] px, (fx, fy, cx, cy), or a focal length: then the principal point is the image's centre
     width: int,
     height: int,
     pixel_center: float = 0.5,  # where K puts the centre of the first pixel; OpenCV's calibration: 0.0
@@ -98,7 +98,7 @@ def from_world(
     transl: Any,  # [3] m, in the world
     R_w2c: Any,  # [3, 3]
     t_w2c: Any,  # [3] m
-    K: Any,  # [3, 3] px, or a focal length
+    K: Any,  # [3, 3] px, (fx, fy, cx, cy), or a focal length
     width: int,
     height: int,
     up: str = "y",  # the world axis against gravity: "y" or "z"
@@ -127,7 +127,7 @@ def from_world(
 
 
 def from_smplx(
-    pose: Any,  # 66, 78, 87, 156, 159 or 165 numbers, or [J, 3], root first; rad
+    pose: Any,  # 66, 78, 87, 156, 159 or 165 numbers, or [J, 3], root first; rad; or matrices [J, 3, 3]
     transl: Any,  # [3] m
     body: Body,
     betas: Any = (0.0,),  # [B] of SMPL
@@ -140,6 +140,9 @@ def from_smplx(
     be taken over: fit SMPL's, or leave the mean shape. Raises `BadInput`.
     """
     array = _numbers("SMPL-X pose", pose, None)
+    if (shape := _without_ones(array.shape))[1:] == (3, 3) and 3 * shape[0] in SMPLX_SIZES:
+        _check_rotations("SMPL-X pose", array)
+        array = matrix_to_axis_angle(array.reshape(shape))
     if array.size not in SMPLX_SIZES or len(_without_ones(array.shape)) > 2:
         raise BadInput(
             f"SMPL-X pose: expected {', '.join(map(str, SMPLX_SIZES))} numbers of axis-angle, root first, "
@@ -276,10 +279,10 @@ def _betas(betas: Any) -> Array:
 
 
 def _size(width: Any, height: Any) -> tuple[int, int]:
-    for value in (width, height):
-        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-            raise BadInput(f"image size: expected whole numbers of pixels, got {width!r} × {height!r}")
-    return int(width), int(height)
+    try:
+        return whole_pixels(width), whole_pixels(height)
+    except ValueError as error:
+        raise BadInput(str(error)) from None
 
 
 def _K(K: Any, width: int, height: int, pixel_center: float) -> Array:
@@ -287,9 +290,12 @@ def _K(K: Any, width: int, height: int, pixel_center: float) -> Array:
     if matrix.size == 1:
         f = float(matrix.reshape(()))
         matrix, pixel_center = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]]), 0.5
+    if _without_ones(matrix.shape) == (4,):
+        fx, fy, cx, cy = matrix.reshape(4)
+        matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     if _without_ones(matrix.shape) != (3, 3):
         raise BadInput(f"K: expected shape [3, 3] or a focal length, got {list(matrix.shape)}; give one frame's")
-    matrix = matrix.reshape(3, 3)
+    matrix = without_rounding(matrix.reshape(3, 3))
     try:
         check_intrinsics(matrix, "K")
     except ValueError as error:

@@ -66,8 +66,11 @@ def test_look_at_is_a_rotation_with_up_in_the_upper_image_half():
         ({"R": np.diag([1.0, 1, -1])}, "reflection"),
         ({"K": np.diag([-1.0, 1, 1])}, "check the signs"),
         ({"K": np.array([[1, 0, 0], [0, 1, 0], [5, 4, 1.0]])}, "transposed"),
-        ({"K": np.diag([1.0, 1, 2])}, "check the signs"),
-        ({"width": 4.0}, "whole numbers"),
+        ({"K": np.diag([1.0, 1, 2])}, "divide it by its last number"),
+        ({"width": 4.5}, "whole numbers"),
+        ({"width": [4, 4]}, "whole numbers"),
+        ({"width": "4"}, "whole numbers"),
+        ({"width": np.inf}, "whole numbers"),
         ({"height": True}, "whole numbers"),
         ({"K": "abc"}, "expected numbers"),
         ({"t": [None, 0, 0]}, "expected numbers"),
@@ -124,10 +127,10 @@ def test_a_short_distortion_is_filled_and_zeros_are_none():
         ({"distortion": np.ones(8)}, "cv2.undistort"),
         ({"distortion": [0.1] * 6}, "fisheye"),
         ({"K": np.array([70.0, 72, 30, 25])}, "fx, 0, cx"),
-        ({"K": np.eye(4)}, "shape"),
+        ({"K": np.eye(4)}, "upper left 3×3"),
         ({"t": np.zeros((3, 4))}, "its last column is t"),
         ({"t": np.zeros(2)}, "three numbers"),
-        ({"R": np.eye(4)}, "shape"),
+        ({"R": np.eye(4)}, "its last column is t"),
         ({"R": np.full(3, np.nan)}, "NaN"),
     ],
 )
@@ -141,3 +144,16 @@ def test_an_opencv_calibration_that_cannot_be_kept_is_refused(change, word):
 def test_a_matrix_whose_square_overflows_is_no_rotation():
     turned = np.stack([np.eye(3), np.full((3, 3), 1e300), -np.full((3, 3), 1e300)])
     assert (off_orthogonal(turned) < 1e-9).tolist() == [True, False, False]
+
+
+@pytest.mark.parametrize("size", [4, 4.0, np.float32(4), np.array(4), np.array([4]), torch.tensor(4.0)])
+def test_a_whole_size_is_taken_from_any_type_of_number(size):
+    camera = Camera(np.eye(3), np.eye(3), np.zeros(3), size, size)
+    assert (camera.width, camera.height) == (4, 4)
+    assert type(camera.width) is int
+
+
+def test_what_a_factorisation_leaves_off_zero_is_no_other_camera():
+    exact = np.array([[900.0, 1, 300], [0, 910, 200], [0, 0, 1]])
+    off = exact + 1e-13 * np.array([[0, 0, 0], [900, 0, 0], [1, -1, 1e-3]])
+    np.testing.assert_array_equal(Camera(off, np.eye(3), np.zeros(3), 60, 50).K, exact)

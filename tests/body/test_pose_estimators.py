@@ -384,6 +384,8 @@ def test_batches_columns_tensors_and_rotation_matrices_are_taken():
         np.testing.assert_array_equal(body_pose.transl, plain[1].transl)
         np.testing.assert_allclose(body_pose.betas, plain[1].betas)
         np.testing.assert_array_equal(camera.K, plain[0].K)
+    four = from_camera_space(pose, np.zeros(10), transl, [K[0, 0], K[1, 1], K[0, 2], K[1, 2]], WIDTH, HEIGHT)
+    np.testing.assert_array_equal(four[0].K, plain[0].K)  # SLAHMR
     matrices = axis_angle_to_matrix(pose)  # 4D-Humans: global_orient [1, 1, 3, 3], body_pose [1, 23, 3, 3]
     both = torch.cat([torch.tensor(matrices[None, :1]), torch.tensor(matrices[None, 1:])], 1).float()
     turned = from_weak_perspective(
@@ -428,6 +430,8 @@ def test_the_joints_that_smplx_shares_are_taken_and_the_pelvis_stays(size):
     taken = from_smplx(pose[None], transl, body, pelvis=pelvis)
     np.testing.assert_array_equal(taken.pose[:22].ravel(), pose[:66])
     assert not taken.pose[22:].any()
+    turned = from_smplx(axis_angle_to_matrix(pose.reshape(-1, 3))[None], transl, body, pelvis=pelvis)
+    np.testing.assert_allclose(turned.pose, taken.pose, atol=1e-12)
     np.testing.assert_allclose(body.posed_joints(taken)[0], pelvis + transl, atol=1e-12)
     for wrong in (np.zeros(72), np.zeros(63), np.zeros((3, 66))):
         with pytest.raises(BadInput, match="SMPL-X pose: expected 66"):
