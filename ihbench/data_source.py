@@ -103,10 +103,16 @@ def open_dataset(name: str, root: Path) -> Dataset:
     try:
         return registry.load("dataset", name)(root)
     except BadInput as error:
-        other = None if "give that folder" in str(error) else folder_nearby(root, (name,))
+        known = "give that folder" in str(error) or is_about_a_file(error, root)
+        other = None if known else folder_nearby(root, (name,))
         if other is None:
             raise
         raise BadInput(f"{error}; did you mean {other}?") from error
+
+
+def is_about_a_file(error: BadInput, root: Path) -> bool:
+    """Whether a data set's complaint is about something in its folder, and not that the folder is none of its own."""
+    return str(error).startswith((f"{root}/", f"{root.absolute()}/"))
 
 
 def folder_nearby(root: Path, datasets: Iterable[str]) -> Path | None:

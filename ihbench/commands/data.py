@@ -64,7 +64,7 @@ def main(argv: list[str]) -> int:
 def _check(chosen: Check) -> int:
     from ihbench.body import load_body
     from ihbench.data_check import add_fitness
-    from ihbench.data_source import body_file, folder_nearby, own_body, own_data
+    from ihbench.data_source import body_file, folder_nearby, is_about_a_file, own_body, own_data
 
     folder = own_data(chosen.folder)
     assert folder is not None
@@ -75,6 +75,8 @@ def _check(chosen: Check) -> int:
         try:
             found = registry.load("dataset", name).check(folder, body)
         except BadInput as error:
+            if is_about_a_file(error, folder):
+                raise
             complaints.append(f"{name}: {error}")
             continue
         add_fitness(found, folder, body, chosen.overlays)

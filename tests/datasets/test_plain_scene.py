@@ -5,6 +5,7 @@ import json
 import shutil
 import time
 import zipfile
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -17,6 +18,8 @@ from ihbench import atomic
 from ihbench.body import load_body
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera, look_at
+from ihbench.commands import data
+from ihbench.data_source import open_dataset
 from ihbench.datasets import plain_scene
 from ihbench.datasets.plain_scene import PlainScene, read_cameras, read_poses
 from ihbench.errors import BadInput
@@ -307,6 +310,9 @@ def test_several_scenes_are_named_by_folder_or_file(tmp_path, own_body):
         plain_scene.write_about(tmp_path / "b", name)
         with pytest.raises(BadInput, match=r"scene\.json"):
             PlainScene(tmp_path)
+        for look in (partial(open_dataset, "custom"), lambda folder: data.main(["check", str(folder)])):
+            with pytest.raises(BadInput, match=r"scene\.json: name .*; rename it$"):  # and not "did you mean" a/
+                look(tmp_path)
     (tmp_path / "b/scene.json").write_text('["name"]')
     with pytest.raises(BadInput, match=r"scene\.json"):
         PlainScene(tmp_path)
