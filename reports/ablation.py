@@ -205,10 +205,10 @@ def _difference(pair: dict[str, Any] | None, metric: Metric) -> str:
         return "—"
     d = metric.decimals
     if pair["n"] == 1:
-        return f"{pair['mean'] * metric.scale:+.{d}f}"
+        return f"{pair['mean'] * metric.scale:+z.{d}f}"
     mean, low, high = (pair[name] * metric.scale for name in ("mean", "low", "high"))
     mark = "*" if pair["p_adjusted"] < ALPHA else ""
-    return f"{mean:+.{d}f}{mark} [{low:+.{d}f}, {high:+.{d}f}]"
+    return f"{mean:+z.{d}f}{mark} [{low:+z.{d}f}, {high:+z.{d}f}]"
 
 
 def _more_seconds(after: Sequence[RunResult], before: Sequence[RunResult]) -> dict[str, Any] | None:
@@ -225,9 +225,9 @@ def _seconds_text(pair: dict[str, Any] | None) -> str:
     """Seconds more (or fewer), their interval, and the share."""
     if pair is None:
         return "—"
-    interval = "" if pair["n"] == 1 else f" [{pair['low']:+.0f}, {pair['high']:+.0f}]"
-    share = "" if pair["share"] is None else f", {pair['share']:+.0%}"
-    return f"{pair['mean']:+.0f}{interval}{share}"
+    interval = "" if pair["n"] == 1 else f" [{pair['low']:+z.0f}, {pair['high']:+z.0f}]"
+    share = "" if pair["share"] is None else f", {pair['share']:+z.0%}"
+    return f"{pair['mean']:+z.0f}{interval}{share}"
 
 
 def _severities(ladder: Ladder, tables: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -177,7 +177,10 @@ def _value(chosen: AblateOptions, config: Any, name: str, text: str) -> Any:
     Switches = make_dataclass(
         "Switches", [("config", Annotated[type(config), tyro.conf.arg(name="method")], config)], frozen=True
     )
-    return flat(options(Switches, [flag, *text.split(",")], "ablate", "").config)[name]
+    words = text.split(",")
+    if len(words) > 1 and not isinstance(known[name], tuple):
+        raise BadInput(f"{name}={text}: expected one value; --vary {name}={BETWEEN.join(words)} is several")
+    return flat(options(Switches, [flag, *words], "ablate", "").config)[name]
 
 
 def _cells(chosen: AblateOptions, ladder: Ladder, progress: Any) -> list[tuple[str, Cell]]:

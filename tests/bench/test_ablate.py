@@ -285,6 +285,7 @@ def test_what_happened_in_a_lent_stage_is_told_of_the_borrower_too(tmp_path):
         (("--vary", "levls=64"), "levls=64: no such switch of inpainthuman: did you mean 'levels'"),
         (("--vary", "steps=many"), "steps"),
         (("--vary", "inpaint.on=perhaps"), "inpaint.on=perhaps: expected on or off"),
+        (("--vary", "steps=1,2"), "steps=1,2: expected one value; --vary steps=1:2 is several"),
         (("--vary", "steps"), "--vary steps: expected NAME=VALUE"),
         (("--vary", "steps=1", "--ladder", "levels"), "--ladder levels with --vary: expected one of the two"),
         (("--ladder", "tabel2"), "--ladder tabel2: did you mean 'table2'"),

@@ -79,6 +79,11 @@ def test_seconds_are_compared_with_an_interval_and_as_a_share(tmp_path):
     assert f"| -98 [{seconds['low']:+.0f}, {seconds['high']:+.0f}], -48% |" in text
     nothing = {"low": [made_up(tmp_path, "a", psnr=20, fit=0)], "high": [made_up(tmp_path, "a", psnr=20, fit=5)]}
     assert "| +5 |" in told(nothing)[0]
+    a_little_less = {
+        "low": [made_up(tmp_path, "a", psnr=20, fit=9.3)],
+        "high": [made_up(tmp_path, "a", psnr=20, fit=9)],
+    }
+    assert "| +0, -3% |" in told(a_little_less)[0]
 
 
 def test_seconds_of_two_clocks_are_not_compared(tmp_path):
