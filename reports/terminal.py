@@ -82,7 +82,11 @@ def _group(runs: Sequence[RunResult], width: int) -> list[str]:
     scenes = sorted({run.scene for run in done})
     told = f"mean over test views of {', '.join(scenes) if len(scenes) <= SHOWN else f'{len(scenes)} scenes'}"
     told += f"; not shown: {', '.join(absent)}" if absent else ""
-    return [*title, "", lines[0], "-" * max(map(cell_len, lines)), *lines[1:], "", *_wrapped(told, width)]
+    reasons = dict.fromkeys(
+        means[i].reason for i in in_headline if i not in present for means in own if i in means and means[i].reason
+    )
+    why = [line for reason in reasons for line in _wrapped(reason, width)]
+    return [*title, "", lines[0], "-" * max(map(cell_len, lines)), *lines[1:], "", *_wrapped(told, width), *why]
 
 
 def _rows(done: Sequence[RunResult], identities: Sequence[str]) -> list[tuple[str, list[str]]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -94,7 +95,7 @@ def _print(report: dict) -> None:
             continue
         m = found["measure"]
         print(f"  {m['training_views']} training views ({m['covered_views']} occluded), {m['test_views']} test views")
-        print(f"  occlusion {m['occlusion']}: hides {m['hidden_share']:.0%} of the person in occluded views")
+        print(f"  occlusion {_rule(m['occlusion'])}: hides {m['hidden_share']:.0%} of the person in occluded views")
         if m["in_scene"]:
             print(
                 "  the occluder stands in the scene: every frame is covered, what it hides in tests is in no region"
@@ -112,3 +113,9 @@ def _print(report: dict) -> None:
             print("  `ihbench run --keep FIELD` keeps what the plan would change, `--keep all` everything")
         if not found["left_out"]:
             print("  left out: nothing; this scene needs all of it")
+
+
+def _rule(occlusion: Mapping[str, Any]) -> str:
+    """A rule and what it was drawn with, as `strip-generic (mid 503, width 60)`."""
+    drawn = ", ".join(f"{name} {value}" for name, value in occlusion.items() if name != "rule")
+    return f"{occlusion['rule']} ({drawn})" if drawn else str(occlusion["rule"])

@@ -44,6 +44,7 @@ def test_plan_says_what_a_run_would_measure_and_leave_out(bench_with_run, finish
     assert told["scenes"]["standin-1"]["measure"] == about["measure"]
     assert told["expected_seconds_per_scene"] == about["total_seconds"]
     assert "5 training views (4 occluded), 4 test views" in plain.out
+    assert re.search(r"^  occlusion strip-generic \(mid \d+, width \d+\): hides ", plain.out, re.M)
     left_out = told["scenes"]["standin-1"]["left_out"]
     assert [omission["field"] for omission in left_out] == ["levels", "texels", "inpaint.facing"]
     levels, texels, _ = left_out
