@@ -27,6 +27,22 @@ class Terminated(KeyboardInterrupt):
         self.number = number
 
 
+_asked: KeyboardInterrupt | None = None  # what was raised, until it is dealt with
+
+
+def asked() -> KeyboardInterrupt | None:
+    """The interruption that has come and not been dealt with, once: libraries in C make other exceptions of it."""
+    global _asked
+    stop, _asked = _asked, None
+    return stop
+
+
+def check() -> None:
+    """Raise again an interruption that a library has swallowed, as callbacks from C do."""
+    if _asked is not None and threading.current_thread() is threading.main_thread():
+        raise _asked
+
+
 def status_of(stop: KeyboardInterrupt) -> int:
     """The exit status that shells know the end by: 128 and the signal's number."""
     return 128 + (stop.number if isinstance(stop, Terminated) else signal.SIGINT)
@@ -45,15 +61,19 @@ def interruptible() -> Iterator[None]:
         owner = os.getpid()
 
         def stop(number: int, frame: object) -> None:
-            if os.getpid() != owner:  # a process that was forked: nobody there expects the exception
+            global _asked
+            if os.getpid() != owner and number != signal.SIGINT:  # forked: nobody there expects the exception
                 signal.signal(number, signal.SIG_DFL)
                 os.kill(os.getpid(), number)
                 return
-            raise Terminated(number)
+            _asked = KeyboardInterrupt() if number == signal.SIGINT else Terminated(number)
+            raise _asked
 
-        for number in (getattr(signal, name) for name in REQUESTS if hasattr(signal, name)):
-            if signal.getsignal(number) is signal.SIG_DFL:
+        for number in (getattr(signal, name) for name in ("SIGINT", *REQUESTS) if hasattr(signal, name)):
+            if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
                 before[number] = signal.signal(number, stop)
+        if before:
+            asked()  # of an earlier block
     try:
         yield
     finally:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ihbench import machine
+from ihbench import interruption, machine
 from ihbench.atomic import decode, encode, write_bytes
 from ihbench.files.regular import read_bytes
 
@@ -121,6 +121,7 @@ class Ledger:
         `fit` as well, so a method may give full paths wherever it is called from. The device is synchronised at both
         ends. Raises `ValueError` for a name that is no path of plain words.
         """
+        interruption.check()
         if not STAGE_NAME.fullmatch(name):
             raise ValueError(f"stage: expected words joined by /, got {name!r}")
         parent = self._chain[-1] if self._chain else ""
@@ -202,6 +203,7 @@ class Ledger:
         costs something, a function that makes it. `force` is for the end of the fit. The fit clock stands still
         until the avatar is scored.
         """
+        interruption.check()
         if self.on_checkpoint is None or (step == self._offered_step if force else self.fit_seconds < self._due):
             return False
         machine.synchronize(self.device)

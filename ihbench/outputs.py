@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterable
-from contextlib import suppress
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +29,28 @@ def write_bytes(path: Path, data: bytes, durable: bool = True) -> None:
     digest = hashlib.sha256(data).hexdigest()
     if _hash(path) == digest:
         return
-    check(path.parent, [path.name])
-    written = _written(path.parent)
-    # first the list, with the old file and the new: a kill in between must not make a stranger of either
-    _note(path, [*written.get(path.name, []), digest], written)
-    atomic.write_bytes(path, data, durable)
-    _note(path, [digest], written)
+    with suppress(OSError):  # said where the file is written
+        path.parent.mkdir(parents=True, exist_ok=True)
+    with _alone(path.parent):
+        check(path.parent, [path.name])
+        written = _written(path.parent)
+        # first the list, with the old file and the new: a kill in between must not make a stranger of either
+        _note(path, [*written.get(path.name, []), digest], written)
+        atomic.write_bytes(path, data, durable)
+        _note(path, [digest], written)
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Keep the list from other commands that write into this folder, where the system can lock one."""
+    with ExitStack() as held:
+        with suppress(OSError, ImportError):
+            import fcntl
+
+            descriptor = os.open(folder, os.O_RDONLY)
+            held.callback(os.close, descriptor)
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
 
 
 def write_text(path: Path, text: str) -> None:

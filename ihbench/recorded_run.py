@@ -13,7 +13,7 @@ from typing import Any
 from ihbench import atomic, machine, removal
 from ihbench.errors import BadInput, Diverged
 from ihbench.failures import one_line
-from ihbench.interruption import interruptible, reason_of, undisturbed
+from ihbench.interruption import asked, interruptible, reason_of, undisturbed
 from ihbench.ledger import Ledger, OnCheckpoint
 from ihbench.progress import Progress
 from ihbench.protocol import Protocol
@@ -51,18 +51,24 @@ class RecordedRun(ABC):
         """Run, and record how it ended. Only bad input and interruption are passed on."""
         try:
             self.work()
-        except Diverged as outcome:
-            self.ledger.event("diverged", step=outcome.step, reason=outcome.reason)
-            self._end("diverged", str(outcome))
-        except BadInput as outcome:
-            self._end("failed", str(outcome))
-            raise
-        except KeyboardInterrupt as stop:
-            self._end("interrupted", reason_of(stop))
-            raise
-        except (Exception, SystemExit) as outcome:  # a method's own exit is a failure of the method
-            reason = f"{type(outcome).__name__}: {str(outcome).splitlines()[0] if str(outcome) else 'no message'}"
-            self._end("failed", f"{reason} (see {TRACEBACK})", traceback.format_exc())
+        except BaseException as error:
+            outcome = asked() or error  # a library may have made something else of an interruption
+            match outcome:
+                case Diverged():
+                    self.ledger.event("diverged", step=outcome.step, reason=outcome.reason)
+                    self._end("diverged", str(outcome))
+                case BadInput():
+                    self._end("failed", str(outcome))
+                    raise
+                case KeyboardInterrupt():
+                    self._end("interrupted", reason_of(outcome))
+                    raise outcome from (None if outcome is error else error)
+                case Exception() | SystemExit():  # a method's own exit is a failure of the method
+                    words = str(outcome).splitlines()[0] if str(outcome) else "no message"
+                    reason = f"{type(outcome).__name__}: {words} (see {TRACEBACK})"
+                    self._end("failed", reason, traceback.format_exc())
+                case _:
+                    raise
 
     def _end(self, status: str, reason: str, details: str = "") -> None:
         with undisturbed():

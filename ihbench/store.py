@@ -298,6 +298,8 @@ class RunFolder:
         """
         with _locked(self.path):
             removal.remove_written(self.path, lambda path: atomic.is_stray(path.name))  # of a process that was killed
+            if not os.path.lexists(self.path / "run.json"):  # a forced rival, or `runs rm`, has made room meanwhile
+                self.save()
             self.record = RunFolder.open(self.path).record
             yield
 

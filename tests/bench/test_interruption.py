@@ -151,6 +151,35 @@ def test_what_ends_a_run_before_its_work_begins_is_recorded_too(tmp_path, monkey
         assert (only_record(tmp_path)["status"], only_record(tmp_path)["reason"]) == outcome[where]
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("made_of_it", [SystemError("returned a result with an exception set"), None])
+def test_what_libraries_in_c_make_of_an_interruption_is_one(tmp_path, number, made_of_it):
+    """numba's unpickling makes a SystemError of it; callbacks, such as llvmlite's, print and forget it."""
+
+    class Compiles(RecordedRun):
+        def work(self):
+            try:
+                os.kill(os.getpid(), number)
+                time.sleep(5)
+            except KeyboardInterrupt:
+                if made_of_it is not None:
+                    raise made_of_it from None
+            with self.ledger.stage("fit"):
+                pytest.fail("the run went on")
+
+    with pytest.raises(KeyboardInterrupt):
+        recorded(tmp_path, IDENTITY, {}, False, lambda folder: Compiles(folder, Progress.silent()))
+    assert only_record(tmp_path)["status"] == "interrupted"
+    assert interruption.asked() is None
+
+
+def test_a_forced_rival_may_make_room_between_the_record_and_the_lock(tmp_path):
+    run = RunFolder.create(tmp_path, IDENTITY)
+    (run.path / "run.json").unlink()
+    with run.lock():
+        assert only_record(tmp_path)["status"] == "running"
+
+
 def test_a_hang_up_that_nohup_ignores_stays_ignored(tmp_path):
     with started(["-c", WAITS], tmp_path, signal.SIGHUP, signal.SIG_IGN) as run:
         assert run.stdout.readline() == "works\n"  # pyright: ignore

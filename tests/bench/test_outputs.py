@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
+import sys
 
 import pytest
 
@@ -26,6 +28,16 @@ def test_a_file_is_written_again_until_somebody_edits_it(tmp_path):
     path.unlink()
     outputs.write_text(path, "three")
     assert path.read_text() == "three"
+
+
+def test_two_commands_in_one_folder_lose_nothing_of_each_others_list(tmp_path):
+    code = (
+        "import sys; from pathlib import Path; from ihbench import outputs\n"
+        "for k in range(40): outputs.write_text(Path(sys.argv[1], f'{sys.argv[2]}-{k}'), sys.argv[2])"
+    )
+    both = [subprocess.Popen([sys.executable, "-c", code, str(tmp_path), name]) for name in ("a", "b")]
+    assert [process.wait(60) for process in both] == [0, 0]
+    assert len(json.loads((tmp_path / outputs.LIST).read_text())) == 80
 
 
 @pytest.mark.parametrize("words", ["", "{", "[]", '{"table.md": 3}', '{"table.md": ["0"]}'])
