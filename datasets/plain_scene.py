@@ -31,9 +31,9 @@ from ihbench.body.skeleton import pose_hint
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera, off_orthogonal
 from ihbench.datasets.capture_folder import CaptureFolder
-from ihbench.datasets.plausibility import Outline, examine
+from ihbench.datasets.plausibility import SOFT_VALUES, Outline, examine
 from ihbench.datasets.standin_mark import STANDIN_FILE
-from ihbench.errors import BadInput
+from ihbench.errors import BadInput, BadValue
 from ihbench.files.npz import read_npz
 from ihbench.files.pictures import encoded, one_line, read_mask, read_rgb
 from ihbench.files.spelling import as_stored, missing_file, same_name
@@ -642,17 +642,52 @@ def write_frame(
     camera_id: str | None = None,  # None: the only camera, without a folder of its own
     ending: str = "png",
 ) -> None:
-    """The picture files of one camera at one frame: PNG, or JPEG with `ending="jpg"`. None is not written."""
+    """The picture files of one camera at one frame: PNG, or JPEG with `ending="jpg"`. None is not written.
+
+    Arrays, tensors and PIL pictures are taken. Raises `ValueError` for another layout or type, for a mask that is not
+    of the image's size, and for a soft one: every pixel above 0 would be person.
+    """
     place = Path(folder)
+    image, mask = as_array(image), as_mask(mask)
     subfolder = camera_id or "."
     if image is not None:
         as_png = ending == "png"
         data = encoded(image, "PNG", compress_level=3) if as_png else encoded(image, "JPEG", quality=JPEG_QUALITY)
+        if mask is not None and mask.shape != image.shape[:2]:
+            sizes = f"{list(image.shape[:2])} like the image, got {list(mask.shape)}"
+            raise BadValue(f"frame {number}: expected a mask {sizes}")
         atomic.write_bytes(place / "images" / subfolder / f"{number:06d}.{ending}", data, durable=False)
     if mask is not None:
-        labels = np.where(np.asarray(mask) != 0, 255, 0).astype(np.uint8)
+        labels = np.where(mask != 0, 255, 0).astype(np.uint8)
         path = place / "masks" / subfolder / f"{number:06d}.png"
         atomic.write_bytes(path, encoded(labels, "PNG", compress_level=3), durable=False)
+
+
+def as_array(picture: Any) -> NDArray | None:
+    """A picture as numpy has it, of a tensor or PIL's too; None stays None."""
+    if hasattr(picture, "detach"):  # a torch tensor; torch itself is not imported for this
+        picture = picture.detach().cpu().numpy()
+    return None if picture is None else np.asarray(picture)
+
+
+def as_mask(mask: Any) -> NDArray | None:
+    """[H, W] of labels, 0 where the person is not. Raises `ValueError` for another layout and for a soft mask."""
+    array = as_array(mask)
+    if array is None:
+        return None
+    if array.ndim == 3 and array.shape[2] == 1:
+        array = array[..., 0]
+    if array.ndim == 3 and array.shape[2] == 3 and array.dtype.kind in "bui":
+        array = array.max(2)
+    if array.ndim != 2 or array.dtype.kind not in "buif":
+        raise BadValue(f"mask: expected [H, W], non-zero for the person, got {array.dtype} {list(array.shape)}")
+    values = np.unique(array)
+    if (array.dtype.kind == "f" and (values != np.rint(values)).any()) or len(values) > SOFT_VALUES:
+        word = "mask > 0.5" if values[-1] <= 1 else "mask > 127"
+        raise BadValue(
+            f"mask: soft, {len(values)} different values, and all above 0 are person; threshold it: {word}"
+        )
+    return array
 
 
 def write_body_file(folder: Path, body: Body) -> None:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench.errors import BadInput
+from ihbench.errors import BadInput, BadValue
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -118,7 +118,7 @@ def read_rgb(path: Path) -> NDArray[np.uint8]:
             f"alpha, on a background"
         )
     if colour.dtype != np.uint8:
-        if 0 < colour.max() <= TWELVE_BITS:
+        if 0 < colour.max() <= TWELVE_BITS and (colour % 257).any():  # 8 bits, rightly scaled, may be dark
             raise BadInput(
                 f"{path}: 16 bits a channel, but no value above {colour.max()} of 65535; scale what has 8, 10 or 12 "
                 f"bits, so that white is 65535"
@@ -210,10 +210,16 @@ def encoded(picture: NDArray[np.uint8], kind: str, **options: int) -> bytes:
     from PIL import Image
 
     if picture.dtype != np.uint8 or picture.ndim not in (2, 3) or (picture.ndim == 3 and picture.shape[2] != 3):
-        raise ValueError(
-            f"picture: expected uint8 [H, W] or [H, W, 3], got {picture.dtype} {picture.shape}; "
-            f"floats in 0..1 are multiplied by 255 and rounded, channels come last"
-        )
+        if picture.ndim == 3 and picture.shape[2] in (2, 4):
+            word = "leave the alpha channel out"
+        elif picture.ndim != 2 and picture.shape[-1] != 3:
+            word = "one picture, its channels last"
+        elif picture.dtype.kind == "f":
+            word = "floats in 0..1 are multiplied by 255 first" if picture.max(initial=0) <= 2 else "round them first"
+        else:
+            word = "16 bits are divided by 257" if picture.dtype == np.uint16 else "astype(np.uint8) of 0 to 255"
+        shape = picture.shape
+        raise BadValue(f"picture: expected uint8 [H, W] or [H, W, 3], got {picture.dtype} {shape}; {word}")
 
     buffer = io.BytesIO()
     Image.fromarray(picture).save(buffer, kind, **options)

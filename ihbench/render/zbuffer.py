@@ -12,6 +12,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from ihbench.camera import whole_pixels
+
 NEAR = 1e-3  # m; a triangle with a corner nearer than this is dropped, not clipped
 
 
@@ -54,8 +56,7 @@ def rasterize(
     `ValueError` for other shapes and for faces that name no point.
     """
     check_mesh(points, faces, "z-buffer")
-    if min(height, width) < 1:
-        raise ValueError(f"z-buffer: expected an image of at least 1×1 px, got {height} rows, {width} columns")
+    height, width = whole_pixels(height), whole_pixels(width)
     points = np.ascontiguousarray(points, np.float64)
     faces = np.ascontiguousarray(faces, np.int32)
     if backend == "auto":

@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -831,3 +832,30 @@ def test_the_examples_of_the_page_run(tmp_path, own_body):
         assert problems_of(known["folder"]) == []
         joints = capture.camera(0).project(capture.model.posed_joints(capture.body_pose(0)))
         assert joints[15, 1] < joints[0, 1] < joints[7, 1]  # head, pelvis, ankle: upright in the picture
+
+
+SOFT = np.linspace(0, 1, 80).reshape(8, 10)
+HARD = SOFT > 0.5
+
+
+@pytest.mark.parametrize(
+    "mask",
+    [HARD, HARD.astype(np.uint8), 255 * HARD.astype(np.uint8), HARD.astype(float), HARD[..., None],
+     torch.tensor(HARD), Image.fromarray(HARD), np.repeat(255 * HARD[..., None].astype(np.uint8), 3, 2),
+     HARD.astype(int) * 7],
+)  # fmt: skip
+def test_a_mask_is_written_from_what_people_have(mask, tmp_path):
+    plain_scene.write_frame(tmp_path, 1, torch.zeros(8, 10, 3, dtype=torch.uint8), mask)
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "masks/000001.png")) == 255, HARD)
+
+
+@pytest.mark.parametrize(
+    ("mask", "word"),
+    [(SOFT, "mask > 0.5"), ((255 * SOFT).astype(np.uint8), "mask > 127"), (HARD.T, "like the image"),
+     (HARD[None, None], "H, W"), (SOFT * 0.5, "mask > 0.5")],
+)  # fmt: skip
+def test_a_mask_that_would_make_more_a_person_is_not_written(mask, word, tmp_path):
+    with pytest.raises(ValueError, match=word):
+        plain_scene.write_frame(tmp_path, 1, np.zeros((8, 10, 3), np.uint8), mask)
+    assert not (tmp_path / "masks").exists()
+    assert not (tmp_path / "images").exists()

@@ -342,8 +342,22 @@ def test_every_damage_to_a_file_is_bad_input(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "picture", [np.zeros((4, 5, 3)), np.zeros((3, 4, 5), np.uint8), np.zeros((4, 5, 4), np.uint8)]
+    ("picture", "word"),
+    [
+        (np.zeros((4, 5, 3)), "multiplied by 255"),
+        (np.full((4, 5, 3), 200.0), "round them"),
+        (np.zeros((3, 4, 5), np.uint8), "channels last"),
+        (np.zeros((4, 5, 4), np.uint8), "leave the alpha"),
+        (np.zeros((4, 5), np.uint16), "divided by 257"),
+        (np.zeros((4, 5), int), "astype"),
+    ],
 )
-def test_only_8_bit_pictures_are_encoded(picture):
-    with pytest.raises(ValueError, match="multiplied by 255 and rounded, channels come last"):
+def test_only_8_bit_pictures_are_encoded(picture, word):
+    with pytest.raises(ValueError, match=f"expected uint8.*{word}"):
         encoded(picture, "PNG")
+
+
+def test_8_bits_in_16_may_be_dark(tmp_path):
+    dark = np.arange(16, dtype=np.uint16).reshape(4, 4)
+    cv2.imwrite(str(tmp_path / "a.png"), 257 * np.repeat(dark[..., None], 3, 2))
+    np.testing.assert_array_equal(read_rgb(tmp_path / "a.png")[..., 0], dark)
