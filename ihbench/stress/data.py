@@ -406,7 +406,7 @@ CASES = [
     _data("picture-none", "a prediction file that is no picture", "words", 0, REFUSED,
           partial(_read, picture, "x.png", b"no picture", "cannot be read as an image")),
     _data("picture-object-array", "a prediction file of Python objects", "words", 0, REFUSED,
-          partial(_read, picture, "x.npy", _npy(np.array([None])), "plain numpy array")),
+          partial(_read, picture, "x.npy", _npy(np.array([None])), "floats in [0, 1], got object")),
     _data("json-cut", "a record that lost its end", "words", 0, REFUSED,
           partial(_read, read_json, "x.json", b'{"a": [1, 2', "not valid JSON")),
     _data("json-not-finite", "NaN, infinities, -0 and the ends of float64", "absolute", 0, "not a bit may change",
