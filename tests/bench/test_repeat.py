@@ -42,7 +42,7 @@ def test_a_run_is_repeated_from_its_record_alone(bench, theirs, tmp_path):
     assert again.name == theirs.name
     assert (again / "scores.jsonl").read_bytes() == before["scores.jsonl"]
     assert "the same scores to the last bit" in outcome.err
-    assert "| mannequin" in outcome.out
+    assert "\nmannequin " in outcome.out
     assert contents(theirs) == before
     (tmp_path / "theirs").rename(bench.runs / "moved")
 
