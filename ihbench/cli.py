@@ -10,7 +10,7 @@ from importlib import import_module
 from ihbench import __version__, registry, streams
 from ihbench.errors import BadInput
 from ihbench.failures import Failure, explained, one_line
-from ihbench.interruption import asked, interruptible
+from ihbench.interruption import interruptible
 from ihbench.provenance import description, note_command
 
 COMMANDS = {
@@ -80,7 +80,7 @@ def _guarded(argv: list[str]) -> int:
             return end.code or 0
         return _tell(argv, Failure(2, "bad input", one_line(str(end.code))))
     except BaseException as error:
-        failure = explained(asked() or error)
+        failure = explained(error)
         if failure is None:  # the reader of our output went away (`ihbench list | head`): not an error of ours
             streams.drop(sys.stdout)
             return 0

@@ -118,7 +118,7 @@ def harmless(value: Any) -> Any:
     try:
         float(value)
     except ValueError:
-        shown = visible(value)
+        shown = visible(value, keep="\n")
         return "'" + shown if value.startswith(FORMULA) else shown
     return value
 

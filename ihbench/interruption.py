@@ -72,13 +72,18 @@ def interruptible() -> Iterator[None]:
         for number in (getattr(signal, name) for name in ("SIGINT", *REQUESTS) if hasattr(signal, name)):
             if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
                 before[number] = signal.signal(number, stop)
-        if before:
-            asked()  # of an earlier block
     try:
         yield
+    except BaseException as error:
+        stop = asked() if before else None
+        if stop is not None and stop is not error:
+            raise stop from error  # a library has made something else of it
+        raise
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+        if before:
+            asked()  # swallowed, and the work done all the same: nothing of it may reach what comes next
 
 
 @contextmanager

@@ -58,7 +58,7 @@ def _block(block: Block, folder: Path) -> str:
             return "\n".join([rows[0], f"|{rule}", *rows[1:]])
         case Picture(png, caption):
             where = Path(os.path.relpath(png, folder)).as_posix()
-            return f"![{plain(caption).replace(']', '')}](<{quote(where)}>)\n\n{plain(caption)}"
+            return f"![{plain(caption).replace(']', '')}](<{quote(where, safe='/@+=,~')}>)\n\n{plain(caption)}"
     raise TypeError(f"report: expected a block of document.py, got {type(block).__name__}")
 
 

@@ -22,6 +22,7 @@ from ihbench.gpu_slots import card_slots, free_memory
 if TYPE_CHECKING:
     from ihbench.ablation import Ladder
     from ihbench.cells import Cell, CellOutcome
+    from ihbench.data_source import DataSource
     from ihbench.progress import Progress
 
 BETWEEN = ":"  # values of one switch
@@ -195,18 +196,10 @@ def _cells(chosen: AblateOptions, ladder: Ladder, progress: Any) -> list[tuple[s
     check_keep(chosen.keep, config)
     shared = getattr(registry.load("config", chosen.method), "SHARED_STATES", {}) if chosen.share else {}
     cells: list[tuple[str, Cell]] = []
+    sources: list[DataSource] = []
     for protocol in chosen.apply(load_protocol(chosen.protocol, chosen.profile)):
         source = locate(protocol, chosen.data, chosen.scene)
-        refused = []
-        for scene in source.scenes:
-            try:
-                source.open(scene, chosen.body, progress)  # makes a stand-in once, before many want it
-            except BadInput as error:  # its cells will say so again; the other scenes go on
-                refused.append((scene, error))
-        if len(refused) == len(source.scenes):
-            raise refused[0][1]
-        for scene, error in refused:
-            progress.say(f"{scene}: {error}")
+        sources.append(source)
         for seed in chosen.seed:
             for scene in source.scenes:
                 first: dict[Any, int] = {}
@@ -224,4 +217,21 @@ def _cells(chosen: AblateOptions, ladder: Ladder, progress: Any) -> list[tuple[s
                     name = f"{protocol.name} {scene} seed {seed}, {rung.name}"
                     waits = after if after != len(cells) else None
                     cells.append((rung.name, Cell(name, request, source, scene, waits)))
+    for source in sources:  # only now that every value is known to be good
+        _open_all(source, chosen.body, progress)
     return cells
+
+
+def _open_all(source: DataSource, body: Path | None, progress: Progress) -> None:
+    """Make stand-ins once, before many want them. Raises `BadInput` where no scene can be opened; of others a line is
+    enough, since their cells say so again."""
+    refused = []
+    for scene in source.scenes:
+        try:
+            source.open(scene, body, progress)
+        except BadInput as error:
+            refused.append((scene, error))
+    if len(refused) == len(source.scenes):
+        raise refused[0][1]
+    for scene, error in refused:
+        progress.say(f"{scene}: {error}")

@@ -148,7 +148,7 @@ def check_images(pred: NDArray, truth: NDArray, *, mixed: bool = False) -> None:
 
 
 def check_brightness(pred: NDArray, truth: NDArray, data_range: float = 1.0) -> None:
-    """Raise `ValueError` for two images of which no pixel is brighter than one 8-bit level, and some are not black.
+    """Raise `ValueError` for two images of which no pixel is brighter than one 8-bit level, and neither is black.
 
     Such are divided by 255 twice, cast to uint8 before they were multiplied, or measured with another data range;
     their errors would all be 48 dB too small.
@@ -156,7 +156,7 @@ def check_brightness(pred: NDArray, truth: NDArray, data_range: float = 1.0) -> 
     images = {"pred": pred, "truth": truth}
     level = 1 if pred.dtype == np.uint8 else 1.001 * data_range / 255
     extents = [extent(image) for image in images.values()]
-    if pred.size == 0 or any(high > level for _, high in extents) or all(low == high == 0 for low, high in extents):
+    if pred.size == 0 or any(high > level for _, high in extents) or any(low == high == 0 for low, high in extents):
         return
     brightest = max(high for _, high in extents)
     word = "multiply by 255 before the cast to uint8" if pred.dtype == np.uint8 else "divided by 255 twice?"

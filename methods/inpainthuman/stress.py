@@ -73,7 +73,10 @@ def fresh(config: InpaintHumanConfig) -> GaussianAvatar:
 
 
 def scaled_rates(factor: float, **changes: Any) -> InpaintHumanConfig:
-    return replace(TINY, **{name: factor * getattr(TINY, name) for name in RATES}, **changes)
+    config = replace(TINY, **changes)
+    for name in RATES:  # past the switches' bounds: the guard of a fit must hold whatever reaches it
+        object.__setattr__(config, name, factor * getattr(TINY, name))
+    return config
 
 
 def fitted(

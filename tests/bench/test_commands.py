@@ -140,7 +140,7 @@ def test_a_report_has_three_formats_and_draws_its_figures(bench_with_run, tmp_pa
     figures, out = tmp_path / "figures", tmp_path / "report.tex"
     words = ("report", "--runs", bench_with_run.runs, "--target", "psnr=5", "flip/hidden=0.9")
     assert bench_with_run(*words, "--format", "tex", "--out", out, "--figures", figures).status == 0
-    names = {file.name for file in figures.iterdir()}
+    names = {file.name for file in figures.iterdir() if not file.name.startswith(".")}
     assert names == {f"{kind}_zju_occ@1_quick.{end}" for kind in ("work-precision", "quality-time")
                      for end in ("png", "svg", "csv")}  # fmt: skip
     assert r"\detokenize{figures/work-precision_zju_occ@1_quick.png}" in out.read_text()

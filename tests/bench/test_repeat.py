@@ -113,7 +113,7 @@ def test_the_record_has_the_command_without_folders_and_the_versions_of_others(
     record = read_json(bench.folders()[0] / "run.json")
     command = record["about"]["command"]
     assert command[:2] == ["run", "--protocol"]
-    assert command[-4:] == ["--method", mannequin, "--seed", "1"]
+    assert command[-5:] == ["--method", mannequin, "--full", "--seed", "1"]
     assert str(tmp_path) not in " ".join(command)
     assert "…/runs" in command
     assert record["provenance"]["packages"]["pytest"] == pytest.__version__

@@ -182,7 +182,7 @@ def test_without_a_home_a_reason_is_given_and_no_run_fails_for_it(homeless, monk
 def test_a_cache_that_may_not_be_written_is_named_with_its_variable(monkeypatch, capsys):
     monkeypatch.setenv("IHBENCH_CACHE", "/proc/nope")
     assert main(["run", "--protocol", "people_snapshot", "--scene", "standin-1"]) == 2
-    assert "name another folder for the cache with IHBENCH_CACHE" in capsys.readouterr().err
+    assert "choose another folder (--out, IHBENCH_CACHE)" in capsys.readouterr().err
 
 
 def test_the_commands(folder, capsys):
