@@ -52,9 +52,9 @@ def _parse(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[
             raise BadInput(
                 f"{path}: line {number}: expected 'vt u v' or a triangle 'f v/vt v/vt v/vt', found {line[:60]!r}"
             ) from None
-    table = np.array(corners, np.int64).reshape(-1, 3, 2)
-    if table.size and np.abs(table).max() >= 2**31:
+    if any(not -(2**31) <= index < 2**31 for corner in corners for index in corner):
         raise BadInput(f"{path}: a face index does not fit 32 bits")
+    table = np.array(corners, np.int64).reshape(-1, 3, 2)
     return np.array(uv, np.float64).reshape(-1, 2), table[..., 0].astype(np.int32), table[..., 1].astype(np.int32)
 
 

@@ -113,8 +113,8 @@ def complains(bench, words, complaint):
     ("words", "complaint"),
     [
         ((), "ceiling: of which run?"),
-        (("--truth", "2"), "expected shares above 0, at most 1"),
-        (("--truth", "0"), "expected shares above 0, at most 1"),
+        (("--truth", "2"), "expected above 0, at most 1"),
+        (("--truth", "0"), "expected above 0, at most 1"),
     ],
 )
 def test_bad_words_are_refused_in_one_line(bench_with_run, words, complaint):

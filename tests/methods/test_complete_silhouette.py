@@ -203,7 +203,7 @@ def test_finders_by_name():
     assert isinstance(silhouette_finder("grabcut", WHITE), GrabCutSilhouette)
     with pytest.raises(BadInput, match=r"--method.inpaint.silhouette 'sma': expected one of coverage, grabcut, sam"):
         silhouette_finder("sma", WHITE)
-    with pytest.raises(BadInput, match=r"--method.inpaint.sam-weights '': no such folder"):
+    with pytest.raises(BadInput, match=r"--method.inpaint.sam-weights '': expected a path"):
         silhouette_finder("sam", WHITE)
 
 
