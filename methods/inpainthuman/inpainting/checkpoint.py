@@ -31,7 +31,7 @@ Rename = Callable[[str], str | None]
 
 def find_folder(where: str, option: str) -> Path:
     """The folder itself, or the cached snapshot of a hub id. `option` is what the user set, for the message."""
-    folder = user_path(where)
+    folder = user_path(where, option)
     if folder.is_dir():
         return folder
     if folder.is_file():

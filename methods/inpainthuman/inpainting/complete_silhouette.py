@@ -243,7 +243,7 @@ def _points_on_parts(parts: NDArray[np.uint8]) -> list[tuple[float, float]]:
 
 def check_sam(weights: str) -> Path:
     """The folder, after what a look can tell. Raises `BadInput`, see `SamSilhouette`."""
-    folder = user_path(weights, "--method.inpaint.sam-weights")
+    folder = user_path(weights, SAM_OPTION)
     if not weights or not folder.is_dir():
         raise BadInput(f"{SAM_OPTION} {weights!r}: no such folder; {SAM_LAYOUT}")
     if not (folder / "config.json").is_file():
