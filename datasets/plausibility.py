@@ -522,7 +522,8 @@ def _check_masks_alone(
     several = []
     for view, mask in masks.items():
         small = mask[_rows(mask.shape[0])][:, _rows(mask.shape[1])]
-        sizes = np.sort(np.bincount(label(small)[0].ravel())[1:])
+        parts: Any = label(small)  # [h, w] with numbers, and how many
+        sizes = np.sort(np.bincount(parts[0].ravel())[1:])
         if len(sizes) > 1 and sizes[-2] > 0.25 * sizes[-1]:
             several.append(view)
     if whole and len(several) > len(masks) / 2:
@@ -715,7 +716,8 @@ def _shift(fits: Sequence[Overlap]) -> tuple[float, str] | None:
     moves = []
     for fit in _evenly(fits, 8):
         size = 2 * fit.mask.shape[0], 2 * fit.mask.shape[1]  # padded: nothing wraps around
-        score = irfft2(rfft2(fit.body, size) * np.conj(rfft2(fit.mask, size)), size)
+        spectra = np.asarray(rfft2(fit.body, size)), np.asarray(rfft2(fit.mask, size))
+        score = np.asarray(irfft2(spectra[0] * np.conj(spectra[1]), size))
         y, x = np.unravel_index(int(score.argmax()), size)
         y, x = (int(v - n if v >= n // 2 else v) for v, n in ((y, size[0]), (x, size[1])))
         moved = np.zeros_like(fit.mask)

@@ -263,9 +263,14 @@ def _read(folder: Path, signed: str) -> tuple[Entry, RunResult | None]:
     identity, record = result.identity, result.record
     if result.status == "running" or record["reason"] == KILLED:
         signed += " at that moment"  # no file changes when a process dies: to be read again
-    parts = [_printable(identity[key]) for key in ("protocol", "scene", "method", "profile")]
-    outcome = result.status, _printable(record["reason"]), record["created"]
-    return Entry(name, signed, *parts, identity["seed"], *outcome), result
+    protocol, scene, method, profile = (
+        _printable(identity[key]) for key in ("protocol", "scene", "method", "profile")
+    )
+    reason = _printable(record["reason"])
+    entry = Entry(
+        name, signed, protocol, scene, method, profile, identity["seed"], result.status, reason, record["created"]
+    )
+    return entry, result
 
 
 def _entry(row: tuple[Any, ...]) -> Entry | None:

@@ -75,9 +75,9 @@ def interruptible() -> Iterator[None]:
     try:
         yield
     except BaseException as error:
-        stop = asked() if before else None
-        if stop is not None and stop is not error:
-            raise stop from error  # a library has made something else of it
+        came = asked() if before else None
+        if came is not None and came is not error:
+            raise came from error  # a library has made something else of it
         raise
     finally:
         for number, handler in before.items():

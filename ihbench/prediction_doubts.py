@@ -185,7 +185,7 @@ def _moved(image: NDArray, truth: NDArray) -> tuple[NDArray[np.float64], float]:
     slopes = np.stack([right.ravel(), down.ravel()], 1).astype(np.float64)
     products = slopes.T @ difference
     solution = np.linalg.lstsq(slopes.T @ slopes, products, rcond=1e-6)[0]
-    return solution, float(solution @ products / np.square(difference).sum())
+    return np.asarray(solution, np.float64), float(solution @ products / np.square(difference).sum())
 
 
 def _small(image: NDArray) -> NDArray[np.float32]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from functools import lru_cache
@@ -260,7 +260,7 @@ def record_fault(record: Any) -> str:
     return ""
 
 
-def outcome_fault(record: Record) -> str:
+def outcome_fault(record: Mapping[str, Any]) -> str:
     """What a run record lacks of what every run says, and every finished one; "" where nothing does."""
     expected = ["standin", "variant"]
     if record["status"] == "done":

@@ -41,13 +41,13 @@ def easymocap_cameras(
     for name in names:
         K, R, t = inner.matrix(f"K_{name}"), outer.matrix(f"R_{name}", f"Rot_{name}"), outer.matrix(f"T_{name}")
         lens = inner.matrix(f"dist_{name}", f"D_{name}", needed=False)
-        size = [given or inner.whole(f"{key}_{name}") for given, key in ((width, "W"), (height, "H"))]
-        if not all(size):
+        w, h = width or inner.whole(f"W_{name}"), height or inner.whole(f"H_{name}")
+        if not w or not h:
             raise BadInput(
                 f"{intri}: camera {name!r} has no W_{name} and H_{name}; give the images' width and height"
             )
         try:
-            cameras[name] = Camera.from_opencv(K, R, t, *size, lens)
+            cameras[name] = Camera.from_opencv(K, R, t, w, h, lens)
         except BadInput as error:
             raise BadInput(f"{intri}: camera {name!r}: {error}") from error
     return cameras
