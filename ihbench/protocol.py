@@ -291,7 +291,7 @@ def read_protocol(path: Path, profile: str = "quick") -> Protocol:
     check_protocol(content, f"protocol file {path}")
     try:
         return _build({**content, "occlusion": _settled(content["occlusion"])}, profile)
-    except ValueError as error:
+    except (ValueError, BadInput) as error:
         raise BadInput(f"protocol file {path}: {error}") from error
 
 

@@ -96,6 +96,7 @@ def read_protocol_text(text):
         ("step = 5 }", "step = 0 }", "train.frames"),
         ("image = { size = 256,", "image = { sice = 256,", "sice"),
         ("[image]", "[image", "p.toml"),
+        ('rule = "fixed-strip"', 'rule = "fixed-strap"', r"p\.toml: unknown occlusion 'fixed-strap': did you mean"),
     ],
 )
 def test_a_malformed_protocol_is_refused_in_one_line(old, new, word):
