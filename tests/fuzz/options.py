@@ -11,11 +11,13 @@ import contextlib
 import io
 import json
 import os
+import pkgutil
 import random
 import stat
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 from unittest.mock import patch
@@ -247,12 +249,23 @@ def _good_words(option: Option, world: World) -> list[str]:
     return words
 
 
+def import_all() -> None:
+    """Import every module of the bench that can be imported here."""
+    for room in ("ihbench", *(f"ihbench.{room}" for room in registry.ROOMS)):
+        for found in pkgutil.walk_packages(import_module(room).__path__, f"{room}."):
+            if not found.name.endswith("__main__"):
+                with contextlib.suppress(ImportError):
+                    import_module(found.name)
+
+
 @contextlib.contextmanager
 def cut_short() -> Iterator[None]:
     """Options are read and checked as ever; the work of minutes behind them is not done."""
 
     def too_long(*_: Any, **__: Any) -> Any:
         raise BadInput("cut short: this would be minutes of work")
+
+    import_all()  # a module imported inside would keep what stands here for good
 
     places = (
         *("ihbench.run_loop.run_scene", "ihbench.cells.run_scene", "ihbench.metrics.check.check"),
