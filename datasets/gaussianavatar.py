@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from ihbench import atomic
 from ihbench.body import Body
+from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.datasets.people_snapshot import (
     SnapshotFolder,
@@ -45,7 +46,6 @@ from ihbench.files.pictures import encoded, read_mask, read_rgb, size_of
 from ihbench.files.spelling import missing_file
 from ihbench.files.tensors import read_tensors
 from ihbench.paths import user_path
-from ihbench.scene import BodyPose
 
 SPLITS = ("train", "test")
 IMAGES, MASKS, CAMERA, POSES = "images", "masks", "cam_parms", "smpl_parms.pth"

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from ihbench import atomic
 from ihbench.body import Body, from_zju_root, zju_root
+from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.datasets.capture_folder import CaptureFolder
 from ihbench.datasets.pickles import write_pickle
@@ -34,7 +35,6 @@ from ihbench.files.spelling import missing_file
 from ihbench.paths import user_path
 from ihbench.registry import nearest
 from ihbench.safe_pickle import load_pickle
-from ihbench.scene import BodyPose
 
 NAME = re.compile(r"(?:camera_(\d+)_)?frame_(\d+)")
 FILES = ("cameras.pkl", "mesh_infos.pkl")

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from ihbench import atomic
 from ihbench.body import Body
+from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.datasets.gaussianavatar import holds_gaussianavatar
 from ihbench.datasets.people_snapshot import (
@@ -46,7 +47,6 @@ from ihbench.files.pictures import above_half, encoded, read_rgb
 from ihbench.files.spelling import missing_file
 from ihbench.paths import user_path
 from ihbench.safe_pickle import load_npy
-from ihbench.scene import BodyPose
 
 CAMERA_FILE, POSES_FILE = "cameras.npz", "poses.npz"
 REFINED = {"train": "poses/anim_nerf_train.npz", "test": "poses/anim_nerf_test.npz"}

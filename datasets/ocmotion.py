@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from ihbench import atomic
 from ihbench.body import Body
+from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera, off_orthogonal
 from ihbench.datasets.capture_folder import BY_OPTIONS, CaptureFolder
 from ihbench.datasets.pickles import write_pickle
@@ -39,7 +40,6 @@ from ihbench.files.spelling import missing_file
 from ihbench.paths import user_path
 from ihbench.registry import nearest
 from ihbench.safe_pickle import load_pickle
-from ihbench.scene import BodyPose
 
 Array = NDArray[np.float64]
 

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from ihbench import atomic
 from ihbench.body import Body
+from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.datasets.ocmotion import (
     OneCameraCapture,
@@ -47,7 +48,6 @@ from ihbench.files.spelling import missing_file
 from ihbench.paths import user_path
 from ihbench.registry import nearest
 from ihbench.safe_pickle import load_pickle
-from ihbench.scene import BodyPose
 
 Array = NDArray[np.float64]
 

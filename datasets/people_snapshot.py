@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from ihbench import atomic
 from ihbench.body import Body
+from ihbench.body.pose import BodyPose
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera, off_orthogonal
 from ihbench.datasets.capture_folder import BY_OPTIONS, CaptureFolder
@@ -42,7 +43,6 @@ from ihbench.files.spelling import missing_file
 from ihbench.paths import user_path
 from ihbench.registry import nearest
 from ihbench.safe_pickle import load_pickle
-from ihbench.scene import BodyPose
 
 if TYPE_CHECKING:
     import h5py

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from ihbench import atomic
 from ihbench.body import Body, from_zju_root, load_body, write_body, zju_root
+from ihbench.body.pose import BodyPose
 from ihbench.body.skeleton import pose_hint
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera, off_orthogonal
@@ -39,7 +40,6 @@ from ihbench.files.pictures import encoded, one_line, read_mask, read_rgb
 from ihbench.files.spelling import as_stored, missing_file, same_name
 from ihbench.paths import user_path
 from ihbench.registry import nearest
-from ihbench.scene import BodyPose
 
 Array = NDArray[np.float64]
 

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.datasets.capture_folder import CaptureFolder
 from ihbench.errors import BadInput
 from ihbench.files.pictures import read_picture
-from ihbench.scene import BodyPose
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from ihbench import atomic
 from ihbench.body import Body, from_zju_root, zju_root
+from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera, off_orthogonal
 from ihbench.datasets.capture_folder import BY_OPTIONS, CaptureFolder
 from ihbench.datasets.pickles import write_object
@@ -35,7 +36,6 @@ from ihbench.files.spelling import missing_file
 from ihbench.paths import user_path
 from ihbench.registry import nearest
 from ihbench.safe_pickle import load_npy
-from ihbench.scene import BodyPose
 
 FOLDER_PREFIX = "CoreView_"
 FITS = ("new_params", "params")  # the newer one first: HumanNeRF and OccNeRF use it

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 from ihbench.kernel_cache import choose_kernel_cache
 from ihbench.threads import bound_spinning
+from ihbench.version import __version__
 
-__version__ = "0.2.0"
-__all__ = ["ablate", "load_scene", "run", "score"]
+__all__ = ["__version__", "ablate", "load_scene", "run", "score"]
 
 choose_kernel_cache()  # before numba
 bound_spinning()  # whoever comes in, by whichever module, comes by here, and mostly before torch

@@ -26,6 +26,7 @@ import numpy as np
 from ihbench import removal
 from ihbench.errors import BadInput
 from ihbench.files.regular import read_bytes
+from ihbench.paths import cache_folder
 
 NON_FINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 MOST_LINKS = 40  # as the system follows
@@ -287,8 +288,6 @@ def _explained(error: OSError, path: Path) -> Exception:
 
 def _advice(path: Path) -> str:
     """How another folder is chosen: the cache's by a variable."""
-    from ihbench.data_source import cache_folder
-
     with suppress(BadInput, OSError):
         if os.path.abspath(path).startswith(os.path.abspath(cache_folder()) + os.sep):
             return "name another folder for the cache with IHBENCH_CACHE"

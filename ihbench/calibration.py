@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from ihbench.body.pose import BodyPose
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera
 from ihbench.render.zbuffer import rasterize
-from ihbench.scene import BodyPose, MaskState, TestView, TrainView
+from ihbench.scene import MaskState, TestView, TrainView
 from ihbench.visibility import surface_texels
 
 if TYPE_CHECKING:

@@ -69,8 +69,6 @@ class Camera:
         Lists, tensors, rows and columns are taken, as OpenCV and its YAML files have them. Only k1 k2 p1 p2 k3 can be
         kept: others must be 0. A distortion of zeros is none. Raises `ValueError`.
         """
-        from ihbench.body.skinning_numpy import axis_angle_to_matrix  # the body imports cameras
-
         K = as_numbers(K, "camera K")
         K = K[0] if K.shape == (1, 3, 3) else K
         if K.shape != (3, 3):
@@ -80,7 +78,9 @@ class Camera:
         K[:2, 2] += 0.5
         R = as_numbers(R, "camera R")
         if R.size == 3:
-            R = axis_angle_to_matrix(R.reshape(3))
+            from scipy.spatial.transform import Rotation
+
+            R = Rotation.from_rotvec(R.reshape(3)).as_matrix()
         elif R.shape == (1, 3, 3):
             R = R[0]
         elif R.shape != (3, 3):

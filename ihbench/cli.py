@@ -7,11 +7,12 @@ import sys
 from contextlib import suppress
 from importlib import import_module
 
-from ihbench import __version__, registry, streams
+from ihbench import registry, streams
 from ihbench.errors import BadInput
 from ihbench.failures import Failure, explained, one_line
 from ihbench.interruption import interruptible
 from ihbench.provenance import description, note_command
+from ihbench.version import __version__
 
 COMMANDS = {
     "run": "fit a method under a protocol, score it, print the table (the main job)",

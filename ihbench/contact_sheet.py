@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench.files.pictures import encoded
 from ihbench.metrics.eight_bit import as_float
 from ihbench.metrics.images import as_image, check_images
 
@@ -83,13 +81,6 @@ def contact_sheet(rows: Sequence[SheetRow], title: str, zoom: int = 1) -> NDArra
             x = PAD + c * (width + PAD) + (width - cell.shape[1]) // 2
             sheet.paste(Image.fromarray(np.ascontiguousarray(cell)), (x, y + LABEL))
     return np.asarray(sheet)
-
-
-def write_png(path: Path, image: NDArray[np.uint8]) -> None:
-    """Write an RGB image whole or not at all. Raises `BadInput` when the disk does not take it."""
-    from ihbench.atomic import write_bytes
-
-    write_bytes(path, encoded(image, "PNG", compress_level=1), durable=False)
 
 
 def _to_8bit(image: NDArray[np.float32]) -> NDArray[np.uint8]:

@@ -15,8 +15,8 @@ from ihbench.scene import Capture
 
 if TYPE_CHECKING:
     from ihbench.body import Body
+    from ihbench.body.pose import BodyPose
     from ihbench.camera import Camera
-    from ihbench.scene import BodyPose
 
 OVERLAYS = Path("data_check")
 OVERLAY_HEIGHT = 480  # px

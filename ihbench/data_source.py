@@ -12,7 +12,7 @@ from ihbench import registry
 from ihbench.body import Body, load_body
 from ihbench.bounds import LARGEST_CAST, refuse_repeated
 from ihbench.errors import BadInput
-from ihbench.paths import path_from, user_path, users_cache
+from ihbench.paths import cache_folder, path_from, user_path
 from ihbench.progress import Progress
 from ihbench.protocol import Protocol
 from ihbench.scene import Capture, Dataset
@@ -22,17 +22,6 @@ if TYPE_CHECKING:
 
 STANDIN_SEED = 0
 NEARBY = 200  # folders that are looked into for data that were not where they were said to be
-
-
-def cache_folder() -> Path:
-    """`IHBENCH_CACHE`, or `ihbench` in the user's cache folder. Raises `BadInput` where there is neither."""
-    own = path_from("IHBENCH_CACHE")
-    if own is not None:
-        return own
-    users = users_cache()
-    if users is None:
-        raise BadInput("this user has no home folder to keep stand-ins in; name a folder for them with IHBENCH_CACHE")
-    return users / "ihbench"
 
 
 def own_data(data: Path | None) -> Path | None:

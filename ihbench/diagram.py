@@ -12,13 +12,11 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ihbench import outputs
-from ihbench.visible_text import visible
+from ihbench.errors import visible
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -63,22 +61,19 @@ def figure(columns: int = 1, rows: int = 1, width: float = 4.6, height: float = 
     return drawn, [axis for row in axes for axis in row]
 
 
-def save(drawn: Figure, path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
-    """Write path.png, path.svg and path.csv, each whole or not at all; returns the PNG's path.
-
-    Raises `BadInput` where they cannot be written, and where somebody else's files of these names are.
-    """
+def files(drawn: Figure, rows: Sequence[Mapping[str, Any]]) -> dict[str, bytes]:
+    """Suffix -> content of the picture (.png, .svg) and of the numbers in it (.csv)."""
     import matplotlib as mpl
 
+    content: dict[str, bytes] = {}
     with mpl.rc_context(STYLE):
         settle(drawn)
         for kind in ("png", "svg"):
             memory = io.BytesIO()
             # an SVG would carry the date, and never be the same file twice
             drawn.savefig(memory, format=kind, dpi=DPI, metadata={"Date": None} if kind == "svg" else None)
-            outputs.write_bytes(path.parent / f"{path.name}.{kind}", memory.getvalue())
-    write_csv(path.parent / f"{path.name}.csv", rows)
-    return path.parent / f"{path.name}.png"
+            content[f".{kind}"] = memory.getvalue()
+    return content | {".csv": csv_text(rows).encode()}
 
 
 def words(text: str) -> str:
@@ -94,7 +89,7 @@ def settle(drawn: Figure) -> None:
         drawn.set_layout_engine("none")
 
 
-def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
     """Rows with the columns of all of them, in order; numbers to the last bit, an absent one is an empty cell."""
     names = list(dict.fromkeys(name for row in rows for name in row))
     text = io.StringIO()
@@ -102,7 +97,7 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     writer.writerow(names)
     for row in rows:
         writer.writerow([_cell(row.get(name)) for name in names])
-    outputs.write_text(path, text.getvalue())
+    return text.getvalue()
 
 
 def _cell(value: Any) -> Any:

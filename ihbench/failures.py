@@ -10,9 +10,8 @@ import traceback
 from dataclasses import dataclass
 
 from ihbench import registry, streams
-from ihbench.errors import BadInput, Diverged
+from ihbench.errors import BadInput, Diverged, visible
 from ihbench.interruption import reason_of, status_of
-from ihbench.visible_text import visible
 
 DEBUG = "IHBENCH_DEBUG"  # environment variable: print tracebacks, too
 REPORT_TO = "please report it with that traceback"

@@ -19,11 +19,12 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from ihbench import __version__, removal
+from ihbench import removal
 from ihbench.errors import BadInput
 from ihbench.metrics import Mean
 from ihbench.results import RunResult, read_result, without_copies
 from ihbench.store import INDEX, KILLED, OUR_NAME
+from ihbench.version import __version__
 
 UNREADABLE = "unreadable"
 FILTERS = ("protocol", "scene", "method", "profile", "seed", "status")

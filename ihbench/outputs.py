@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -61,6 +61,13 @@ def write_text(path: Path, text: str) -> None:
 def write_json(path: Path, value: Any) -> None:
     """As `atomic.write_json` writes."""
     write_text(path, atomic.json_text(value))
+
+
+def write_files(path: Path, files: Mapping[str, bytes]) -> Path:
+    """Files of one name, by suffix. Returns the first one's path."""
+    for suffix, data in files.items():
+        write_bytes(path.parent / f"{path.name}{suffix}", data)
+    return path.parent / f"{path.name}{next(iter(files))}"
 
 
 def check(folder: Path, names: Iterable[str]) -> None:

@@ -64,3 +64,14 @@ def users_cache() -> Path | None:
         return path_from("XDG_CACHE_HOME") or Path("~/.cache").expanduser()
     except RuntimeError:
         return None
+
+
+def cache_folder() -> Path:
+    """`IHBENCH_CACHE`, or `ihbench` in the user's cache folder. Raises `BadInput` where there is neither."""
+    own = path_from("IHBENCH_CACHE")
+    if own is not None:
+        return own
+    users = users_cache()
+    if users is None:
+        raise BadInput("this user has no home folder to keep stand-ins in; name a folder for them with IHBENCH_CACHE")
+    return users / "ihbench"

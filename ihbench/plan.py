@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ihbench.body.pose import BodyPose
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera
 from ihbench.occlusion import OcclusionPlan, apply_rule, withheld
 from ihbench.protocol import Protocol
-from ihbench.scene import BodyPose, Capture, MaskState
+from ihbench.scene import Capture, MaskState
 from ihbench.visibility import Visibility, texel_visibility
 
 if TYPE_CHECKING:

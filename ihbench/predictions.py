@@ -28,16 +28,15 @@ from numpy.typing import NDArray
 
 from ihbench import registry
 from ihbench.errors import BadInput
-from ihbench.files.pictures import Header, header_of, read_picture
+from ihbench.files.images import ALPHAS, read_channels, read_image
+from ihbench.files.pictures import Header, header_of
 from ihbench.metrics.images import Color
 from ihbench.name_pattern import NamePattern
-from ihbench.safe_pickle import load_npy
 from ihbench.views import TestViewKey
 
 DEFAULT_PATTERNS = ("{scene}/{camera}/{frame:06d}.png", "{camera}/{frame:06d}.png")
 WORDS, NUMBERS = ("scene", "camera"), ("camera_index", "frame", "index")  # placeholders
 SUFFIXES = (".png", ".jpg", ".jpeg", ".npy")
-ALPHAS = ("straight", "premultiplied", "composited")
 ROUNDING = 2 / 255, 16 / 255  # of colours, in files with and without loss
 MOST_SIZES = 100  # images of a scene whose size is looked at
 SOME = 0.01  # share of pixels: fewer may be colours beyond white, which renderers clip
@@ -148,7 +147,7 @@ def size_of_most(
 
 
 def _longer_side(path: Path) -> int:
-    return max(_read(path).shape[:2]) if path.suffix.lower() == ".npy" else max(_header(path).size)
+    return max(read_channels(path).shape[:2]) if path.suffix.lower() == ".npy" else max(_header(path).size)
 
 
 def expected_names(pattern: str | None, scene: str, keys: Sequence[TestViewKey]) -> list[str]:
@@ -170,7 +169,7 @@ def find_alpha(files: Sequence[Path], background: Color, named: str | None = Non
         is_array = path.suffix.lower() == ".npy"
         if not is_array and not _header(path).alpha:
             continue
-        image = _read(path)
+        image = read_channels(path)
         if image.shape[2] not in (2, 4):
             continue
         tolerance = ROUNDING[not is_array and _header(path).lossy]
@@ -209,59 +208,8 @@ def _possible(against: dict[str, NDArray]) -> list[str]:
     ]
 
 
-def read_image(path: Path, background: Color, alpha: str = ALPHAS[0]) -> NDArray:
-    """[H, W, 3]: uint8 from 8-bit files, float in [0, 1] from 16-bit PNG and float arrays (.npy).
-
-    Transparent images are composited on `background`, see ALPHAS; grey ones get three equal channels. Raises
-    `BadInput` for what cannot be read or is no image.
-    """
-    image = _read(path)
-    if image.shape[2] in (2, 4):
-        image = _composited(image[..., :-1], image[..., -1:], background, alpha)
-    return np.repeat(image, 3, axis=2) if image.shape[2] == 1 else np.ascontiguousarray(image)
-
-
-def _composited(color: NDArray, share: NDArray, background: Color, alpha: str) -> NDArray:
-    """[H, W, 1 or 3] colours [H, W, 1 or 3] with alpha `share` [H, W, 1] on the background."""
-    if alpha == "composited" or (color.dtype == np.uint8 and (share == 255).all()):
-        return color
-    if color.dtype == np.uint8:
-        color, share = color / 255.0, share / 255.0
-    painted = color * share if alpha == "straight" else color
-    return painted + np.asarray(background, color.dtype) * (1 - share)
-
-
 def _header(path: Path) -> Header:
     return header_of(path, f"prediction {path}")
-
-
-def _read(path: Path) -> NDArray:
-    """[H, W, 1 to 4] as `read_image` says, with its alpha channel."""
-    image = _read_array(path) if path.suffix.lower() == ".npy" else _read_picture(path)
-    if image.ndim == 2:
-        image = image[..., None]
-    if image.ndim != 3 or image.shape[2] not in (1, 2, 3, 4) or 0 in image.shape:
-        hint = "; move its channels last" if image.ndim == 3 and image.shape[0] in (1, 2, 3, 4) else ""
-        raise BadInput(
-            f"prediction {path}: expected an image [H, W], [H, W, 3] or [H, W, 4], got shape {image.shape}{hint}"
-        )
-    return image
-
-
-def _read_picture(path: Path) -> NDArray:
-    """[H, W, C] uint8, or float in [0, 1] of 16 bits."""
-    values = read_picture(path, f"prediction {path}").values
-    return values if values.dtype == np.uint8 else values.astype(np.float32) / 65535
-
-
-def _read_array(path: Path) -> NDArray:
-    try:
-        array = load_npy(path)
-    except BadInput as error:
-        raise BadInput(f"prediction {error}") from error
-    if array.dtype != np.uint8 and array.dtype.kind != "f":
-        raise BadInput(f"prediction {path}: expected uint8, or floats in [0, 1], got {array.dtype}")
-    return array.astype(np.float32) if array.dtype.itemsize > 8 else array
 
 
 def _expected(pattern: str, scene: str, keys: Sequence[TestViewKey]) -> tuple[str, dict[TestViewKey, str]]:

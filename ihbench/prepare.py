@@ -21,12 +21,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench import __version__, atomic, locks, registry, removal
+from ihbench import atomic, locks, registry, removal
 from ihbench.body import Body
+from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.errors import BadInput
 from ihbench.progress import Progress
-from ihbench.scene import BodyPose, MaskState, TrainView
+from ihbench.scene import MaskState, TrainView
+from ihbench.version import __version__
 from ihbench.views import OccludedScene
 
 MANIFEST = "manifest.json"
@@ -219,7 +221,7 @@ def _write(
         raise BadInput(
             f"layout {layout!r} cannot hold {scene.capture.name}: {error}; choose another --layout"
         ) from error
-    from ihbench.contact_sheet import write_png
+    from ihbench.files.images import write_png
 
     for number, view in enumerate(views):
         unknown = np.repeat(((view.mask == MaskState.UNKNOWN) * np.uint8(255))[..., None], 3, axis=2)

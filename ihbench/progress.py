@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TextIO
 
+from ihbench.errors import visible
 from ihbench.streams import say
-from ihbench.visible_text import visible
 
 PLAIN_EVERY = 10.0  # s between two plain lines of one task
 MODES = ("auto", "bar", "plain", "silent")

@@ -10,8 +10,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import ihbench
 from ihbench import registry
+from ihbench.version import __version__
 
 PACKAGES = (
     "numpy",
@@ -36,7 +36,7 @@ _words: list[str] = []  # of the command that this process was started for; none
 
 def provenance() -> dict[str, Any]:
     """Versions to store with a run. Reads package metadata only; imports none of the packages."""
-    return {"ihbench": ihbench.__version__, "git": git_state(), "packages": package_versions()}
+    return {"ihbench": __version__, "git": git_state(), "packages": package_versions()}
 
 
 def package_versions() -> dict[str, str]:
@@ -72,12 +72,12 @@ def description() -> str:
     git, packages = git_state(), package_versions()
     commit = "" if git is None else f", commit {git['commit'][:10]}{' with changes' if git['dirty'] else ''}"
     computing = ", ".join(f"{name} {packages[name]}" for name in ("torch", "numpy", "numba") if name in packages)
-    return f"{ihbench.__version__}{commit} (Python {platform.python_version()}, {computing})"
+    return f"{__version__}{commit} (Python {platform.python_version()}, {computing})"
 
 
 def git_state(folder: Path | None = None) -> dict[str, Any] | None:
     """Commit of the checkout this code runs from and whether files differ from it; None outside a checkout."""
-    folder = folder if folder is not None else Path(ihbench.__file__).resolve().parent
+    folder = folder if folder is not None else Path(__file__).resolve().parent
     if _git(folder, "ls-files", "--error-unmatch", "__init__.py") is None:
         return None  # installed into some other project's checkout, or into none
     commit = _git(folder, "rev-parse", "HEAD")

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from ihbench import atomic
 from ihbench.errors import BadInput
+from ihbench.files.images import read_image
 from ihbench.metrics.evaluate import Preset, find_preset
-from ihbench.predictions import read_image
 from ihbench.progress import Progress
 from ihbench.record import preset_lines
 from ihbench.reopen import reopen_protocol, reopen_scene

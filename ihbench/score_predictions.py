@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ihbench import __version__
 from ihbench.capture_digest import capture_digest
 from ihbench.data_source import DataSource
 from ihbench.prediction_doubts import Doubts
@@ -21,6 +20,7 @@ from ihbench.score_stage import ScoreStage
 from ihbench.scoring import Scorer
 from ihbench.source_digest import bench_code
 from ihbench.store import RunFolder, RunIdentity
+from ihbench.version import __version__
 from ihbench.views import OccludedScene, open_scene
 
 if TYPE_CHECKING:

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from ihbench import atomic
 from ihbench.calibration import ROWS, Calibration
-from ihbench.contact_sheet import SheetRow, contact_sheet, write_png
+from ihbench.contact_sheet import SheetRow, contact_sheet
 from ihbench.errors import BadInput
+from ihbench.files.images import write_png
 from ihbench.metrics.eight_bit import rounded
 from ihbench.progress import Progress
 from ihbench.record import score_lines

@@ -22,8 +22,9 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ihbench import __version__, registry
+from ihbench import registry
 from ihbench.errors import BadInput
+from ihbench.version import __version__
 
 if TYPE_CHECKING:
     from ihbench.protocol import Protocol

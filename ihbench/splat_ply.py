@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.atomic import write_bytes
-from ihbench.visible_text import visible
+from ihbench.errors import visible
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic: colour = 0.5 + SH_C0 * f_dc
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)  # quaternion, w first

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any, TextIO
 
-from ihbench.visible_text import visible
+from ihbench.errors import visible
 
 STYLE = re.compile(r"(\x1b\[[0-9;]*m)")  # what colours and weighs text on a terminal
 

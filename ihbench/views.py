@@ -16,12 +16,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.errors import BadInput
 from ihbench.metrics.images import bounds
 from ihbench.occlusion import OcclusionPlan, apply_rule, grown_for_clothes
 from ihbench.protocol import ImageRule, Protocol
-from ihbench.scene import BodyPose, Capture, MaskState, TestView, TrainView
+from ihbench.scene import Capture, MaskState, TestView, TrainView
 
 if TYPE_CHECKING:
     from ihbench.body import Body

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.render.zbuffer import rasterize
-from ihbench.scene import BodyPose, MaskState
+from ihbench.scene import MaskState
 
 if TYPE_CHECKING:
     from ihbench.body import Body

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ihbench import diagram
+from ihbench import diagram, outputs
 from ihbench.metrics import Identity
 from ihbench.metrics.identity import METRICS
 from ihbench.metrics.statistics import Interval, interval_ends
@@ -124,7 +124,7 @@ def _work_precision(
         f"logarithmic; bars are {LEVEL:.0%} intervals over scenes, or over repeats of a single one, and "
         "may run out of the picture."
     )
-    return [(diagram.save(drawn, path, rows), caption)]
+    return [(outputs.write_files(path, diagram.files(drawn, rows)), caption)]
 
 
 def _points(
@@ -256,7 +256,7 @@ def _quality_time(
         f"Quality against the fit clock, {title} ({about}), by region, on {views} test views. Lines: mean over "
         f"scenes of the checkpoints of their runs{crowd}. Scoring does not count as time."
     )
-    return [(diagram.save(drawn, path, rows), caption)]
+    return [(outputs.write_files(path, diagram.files(drawn, rows)), caption)]
 
 
 def _curve_panel(

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from ihbench.errors import visible
 from ihbench.reports.latex import NEEDS, PREAMBLE, escape
 from ihbench.reports.paper_table import Block, Cell, Frame, Row
-from ihbench.visible_text import visible
 
 MARKS = {"best": r"\textbf{%s}", "second": r"\underline{%s}", "": "%s"}
 PAIRED = "% ihbench lint: paired"  # tells the linter that marks come from paired differences

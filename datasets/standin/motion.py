@@ -16,9 +16,9 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from ihbench.body import Body
+from ihbench.body.pose import BodyPose
 from ihbench.body.skeleton import JOINT_INDEX
 from ihbench.body.skinning_numpy import joint_transforms, lbs
-from ihbench.scene import BodyPose
 
 Array = NDArray[np.float64]
 

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.body import Body
+from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera, look_at
 from ihbench.datasets.standin import motion, outfit
 from ihbench.datasets.standin.lighting import studio_lighting
 from ihbench.datasets.standin.photograph import photograph
 from ihbench.datasets.standin.subject import ROUTINES
-from ihbench.scene import BodyPose
 
 VERSION = 1
 STREAM = (86, *b"passer-by")  # stand-ins' streams are (seed, number, *words); no word of theirs is this one

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench import atomic
+from ihbench.body.pose import BodyPose
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera, look_at
 from ihbench.datasets import people_snapshot
@@ -25,7 +26,6 @@ from ihbench.datasets.standin.studio import empty_studio
 from ihbench.datasets.standin.subject import Subject
 from ihbench.files.pictures import encoded
 from ihbench.progress import Progress
-from ihbench.scene import BodyPose
 
 VERSION = 1  # of the generator; a change that moves a pixel raises it
 TURN_FRAMES, TEST_FRAMES = 160, 80

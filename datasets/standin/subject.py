@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.body import Body
+from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.datasets.standin import motion, outfit
 from ihbench.datasets.standin.lighting import Lighting, studio_lighting
 from ihbench.datasets.standin.rig import camera_ring
-from ihbench.scene import BodyPose
 
 # what each member of a cast does; odd members turn all the way round, even ones look about
 ROUTINES: tuple[tuple[str, ...], ...] = (

@@ -21,7 +21,7 @@ from ihbench.errors import BadInput
 
 if TYPE_CHECKING:
     from ihbench.body.model import Body
-    from ihbench.scene import BodyPose
+    from ihbench.body.pose import BodyPose
 
 FIT = ("poses", "shapes", "Rh", "Th")
 

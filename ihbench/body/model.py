@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.body import skinning_numpy
+from ihbench.body.pose import BodyPose
 from ihbench.errors import BadInput
-from ihbench.scene import BodyPose
 
 Array = NDArray[np.float64]
 

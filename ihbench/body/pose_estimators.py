@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ihbench.body.pose import BodyPose
 from ihbench.body.root_convention import from_zju_root
 from ihbench.body.skeleton import SMPLX_SIZES, pose_hint
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera, as_numbers, check_intrinsics, check_rotation, whole_pixels, without_rounding
 from ihbench.errors import BadInput
-from ihbench.scene import BodyPose
 
 if TYPE_CHECKING:
     from ihbench.body.model import Body

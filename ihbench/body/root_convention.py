@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ihbench.body.pose import BodyPose
 from ihbench.body.skeleton import pose_hint
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.errors import BadInput
-from ihbench.scene import BodyPose
 
 if TYPE_CHECKING:
     from ihbench.body.model import Body

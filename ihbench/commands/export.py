@@ -12,6 +12,7 @@ import tyro
 from ihbench.bounds import WHOLE, whole
 from ihbench.commands.parse import options
 from ihbench.errors import BadInput
+from ihbench.version import __version__
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ def _pose(name: str, avatar: Any, open_capture: Any) -> Any:
     import numpy as np
 
     from ihbench.body.canonical import canonical_pose
-    from ihbench.scene import BodyPose
+    from ihbench.body.pose import BodyPose
 
     if WHOLE.fullmatch(name):
         return open_capture().body_pose(whole(name))
@@ -74,9 +75,9 @@ def _pose(name: str, avatar: Any, open_capture: Any) -> Any:
 
 def _for_viewers(means: Any, pose: Any, avatar: Any, chosen: ExportOptions) -> Any:
     """[N, 3] m, upright about the pelvis of the avatar's own body."""
+    from ihbench.body.pose import BodyPose
     from ihbench.body.skinning_numpy import axis_angle_to_matrix
     from ihbench.reopen import reopen_body
-    from ihbench.scene import BodyPose
     from ihbench.splat_ply import in_viewer_axes
 
     body = getattr(avatar, "body", None) or reopen_body(chosen.run, chosen.data, chosen.body)
@@ -86,7 +87,6 @@ def _for_viewers(means: Any, pose: Any, avatar: Any, chosen: ExportOptions) -> A
 
 def _comments(chosen: ExportOptions) -> list[str]:
     """What the file says of itself. Brush and splat-transform read the last."""
-    import ihbench
     from ihbench.store import RunFolder
 
     folder = RunFolder.open(chosen.run)
@@ -96,7 +96,7 @@ def _comments(chosen: ExportOptions) -> list[str]:
         "world": "those of the data set",
     }[chosen.axes]
     return [
-        f"Exported from ihbench {ihbench.__version__}",
+        f"Exported from ihbench {__version__}",
         f"run: {folder.record['digest']} {identity['method']} {identity['scene']}",
         f"pose: {chosen.pose}",
         "units: metres",

@@ -14,8 +14,7 @@ import tyro
 
 from ihbench import atomic, outputs, registry
 from ihbench.commands.parse import options
-from ihbench.errors import BadInput
-from ihbench.visible_text import visible
+from ihbench.errors import BadInput, visible
 
 if TYPE_CHECKING:
     from ihbench.results import RunResult

@@ -214,8 +214,8 @@ def _size(folder: Path) -> int:
 
 
 def _cells(row: dict[str, Any]) -> tuple[str, ...]:
+    from ihbench.errors import visible
     from ihbench.metrics.identity import metric_of
-    from ihbench.visible_text import visible
 
     value = "" if row["value"] is None else metric_of(row["identity"]).text(row["value"])
     named = (row[name] for name in ("status", "protocol", "scene", "method", "profile", "seed"))

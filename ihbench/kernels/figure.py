@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ihbench import diagram
+from ihbench import diagram, outputs
 from ihbench.kernels.measuring import Row
 
 COLUMNS = 3
@@ -45,7 +45,7 @@ def draw(rows: Sequence[Row], about: Mapping[str, Any], folder: Path) -> Path:
     drawn.suptitle(f"Kernels: error against the float64 oracle over milliseconds\n{machine}", fontsize=11)
     for panel, (labels, lines) in zip(axes, later, strict=False):
         diagram.place_labels(panel, labels, lines)
-    return diagram.save(drawn, path, records)
+    return outputs.write_files(path, diagram.files(drawn, records))
 
 
 def _panel(

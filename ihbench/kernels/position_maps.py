@@ -24,7 +24,7 @@ def position_map_rows(repeats: int, cases: Sequence[int] = POSITION_CASES) -> li
     extrapolated from the texels that it looked at.
     """
     from ihbench.body import load_body, position_map, texel_table
-    from ihbench.scene import BodyPose
+    from ihbench.body.pose import BodyPose
 
     body = load_body()
     pose = BodyPose(np.random.default_rng(0).normal(0, 0.3, (24, 3)), np.zeros(10), np.zeros(3))

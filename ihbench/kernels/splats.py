@@ -100,8 +100,9 @@ def compare_with_twin(
     """
     import torch
 
-    from ihbench.render.splat import ALPHA_MIN, project_gaussians, render_gaussians
+    from ihbench.render.splat import project_gaussians, render_gaussians
     from ihbench.render.splat_reference import alphas_near_threshold
+    from ihbench.render.splats import ALPHA_MIN
 
     inputs = (scene.means, scene.scales, scene.colors)
     camera = scene.camera

@@ -267,7 +267,7 @@ def _published_lpips(examples: Path | None) -> Iterator[Comparison]:
     if examples is None or not (examples / "ex_ref.png").is_file():
         yield absent("the example images (ex_ref.png, ex_p0.png, ex_p1.png) are not given: --lpips-examples DIR")
         return
-    from ihbench.predictions import read_image
+    from ihbench.files.images import read_image
 
     truth = read_image(examples / "ex_ref.png", WHITE)
     for name, value in EXAMPLES.items():

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from ihbench.errors import MissingPrerequisite
-from ihbench.render.splat import ALPHA_MAX, ALPHA_MIN, Splats
+from ihbench.render.splats import ALPHA_MAX, ALPHA_MIN, Splats
 
 TILE = 16  # px
 _LARGEST_RADIUS = 2**30  # px; gsplat takes int32 radii

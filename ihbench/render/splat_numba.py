@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ihbench.render.splat import ALPHA_MAX, ALPHA_MIN, Splats
+from ihbench.render.splats import ALPHA_MAX, ALPHA_MIN, Splats
 
 TILE = 16  # px
 CHUNK = 32  # splats between two stored transmittances

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from ihbench.render.splat import ALPHA_MAX, ALPHA_MIN, Splats
+from ihbench.render.splats import ALPHA_MAX, ALPHA_MIN, Splats
 
 
 def composite(

@@ -22,10 +22,10 @@ from ihbench.calibration import Calibration
 from ihbench.camera import Camera
 from ihbench.data_check import fitness
 from ihbench.errors import BadInput
+from ihbench.files.images import read_image
 from ihbench.ledger import Ledger
 from ihbench.occlusion import apply_rule
 from ihbench.plan import measure_scene
-from ihbench.predictions import read_image
 from ihbench.protocol import Protocol, Span
 from ihbench.safe_pickle import load_npy, load_pickle
 from ihbench.scene import MaskState

@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.body import JOINT_INDEX, Body, load_body
+from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera, look_at
 from ihbench.protocol import Protocol, Span, load_protocol
 from ihbench.render.zbuffer import Raster, rasterize
-from ihbench.scene import BodyPose, MaskState, TrainView
+from ihbench.scene import MaskState, TrainView
 
 SIZE = 96  # px
 DISTANCE = 3.0  # m

@@ -14,6 +14,7 @@ from torch.nn.functional import embedding_bag
 
 from ihbench.body import Body
 from ihbench.body.canonical import canonical_pose
+from ihbench.body.pose import BodyPose
 from ihbench.body.uv import chart_padding, texel_table
 from ihbench.camera import Camera
 from ihbench.errors import BadInput
@@ -23,7 +24,6 @@ from ihbench.methods.inpainthuman.pose_residual import ResidualEncoder, root_fre
 from ihbench.methods.inpainthuman.uv_features import UVFeatures, bilinear_corners
 from ihbench.render.splat import render_gaussians
 from ihbench.render.zbuffer import rasterize
-from ihbench.scene import BodyPose
 
 CULL_SLACK = 0.04  # m behind the nearest body surface; garments and offsets stay well within it
 CULL_BACK_SLACK = 0.012  # m, for points whose normal is turned well away: the far side of an arm, not of a finger

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
-from ihbench.scene import BodyPose
+from ihbench.body.pose import BodyPose
 
 if TYPE_CHECKING:
     from ihbench.body import Body

@@ -168,8 +168,8 @@ class Stage2:
         self.ledger.save_state(STATE, tensors, {"views": rows})
 
     def _restored(self) -> list[PaintedView] | None:
+        from ihbench.body.pose import BodyPose
         from ihbench.camera import Camera
-        from ihbench.scene import BodyPose
 
         saved = self.ledger.load_state(STATE)
         if saved is None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
-from ihbench.scene import BodyPose, MaskState, TestView
+from ihbench.scene import MaskState, TestView
 from ihbench.stress.drawn_capture import (
     DISTANCE,
     FOCAL,

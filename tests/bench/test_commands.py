@@ -12,11 +12,11 @@ import pytest
 from ihbench import registry
 from ihbench.atomic import read_json, read_json_lines
 from ihbench.body.canonical import canonical_pose
+from ihbench.body.pose import BodyPose
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.data_source import standin_root
 from ihbench.results import read_result
 from ihbench.run_loop import load_avatar
-from ihbench.scene import BodyPose
 from ihbench.splat_ply import read_splat_ply
 from tests.conftest import contents, tiny_protocol
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ihbench import diagram
+from ihbench import diagram, outputs
 from ihbench.diagram import Label, place_labels, round_ticks, tick_text
 
 
@@ -67,7 +67,7 @@ def test_three_files_and_the_same_picture_is_the_same_file(tmp_path):
     def once(name):
         drawn, (axes,) = diagram.figure()
         axes.plot([1, 2], [1, 2])
-        return diagram.save(drawn, tmp_path / name / "x", [{"a": 1.0}])
+        return outputs.write_files(tmp_path / name / "x", diagram.files(drawn, [{"a": 1.0}]))
 
     first, second = once("one"), once("two")
     for ending in (".png", ".svg", ".csv"):
@@ -76,7 +76,7 @@ def test_three_files_and_the_same_picture_is_the_same_file(tmp_path):
 
 def test_a_csv_keeps_every_bit_and_no_spreadsheet_takes_a_name_for_a_formula(tmp_path):
     rows = [{"name": "=cmd|' /C calc'!A0", "x": 0.1 + 0.2}, {"x": math.nan, "more": 'a,b\n"c"'}]
-    diagram.write_csv(tmp_path / "t.csv", rows)
+    (tmp_path / "t.csv").write_text(diagram.csv_text(rows))
     first, second = csv.DictReader((tmp_path / "t.csv").open(newline=""))
     assert first["name"].startswith("'=")
     assert float(first["x"]) == 0.1 + 0.2

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ihbench import plan
 from ihbench.body import texel_table
+from ihbench.body.pose import BodyPose
 from ihbench.config_fields import flat, with_fields
 from ihbench.earlier_runs import earlier_runs
 from ihbench.methods.inpainthuman import config as method_config
@@ -29,7 +30,6 @@ from ihbench.plan import (
     measure_scene,
 )
 from ihbench.protocol import REGIONS
-from ihbench.scene import BodyPose
 from ihbench.views import open_scene
 from ihbench.visibility import texel_visibility
 from tests.reports.fake_runs import identity

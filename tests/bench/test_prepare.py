@@ -151,7 +151,7 @@ def rodrigues(v):
 
 def zju_vertices(params):
     """World vertices from ZJU-MoCap's parameters: zero root, then Rh about the origin and Th."""
-    from ihbench.scene import BodyPose
+    from ihbench.body.pose import BodyPose
 
     still = BodyPose(
         np.asarray(params["poses"]).reshape(24, 3), np.asarray(params["shapes"]).reshape(-1), np.zeros(3)
@@ -207,7 +207,7 @@ def test_humannerf_reads_its_layout(scene, tmp_path):
 
 
 def smpl_vertices(pose, betas, transl):
-    from ihbench.scene import BodyPose
+    from ihbench.body.pose import BodyPose
 
     return the_body().pose(BodyPose(np.asarray(pose, np.float64).reshape(24, 3), betas, transl))
 

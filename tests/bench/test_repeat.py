@@ -123,5 +123,5 @@ def test_the_record_has_the_command_without_folders_and_the_versions_of_others(
 
 def test_the_version_says_what_computes(bench):
     out = bench("--version").out
-    assert out.startswith(provenance.ihbench.__version__)
+    assert out.startswith(provenance.__version__)
     assert f"torch {provenance.package_versions()['torch']}" in out

@@ -13,7 +13,8 @@ from ihbench import atomic
 from ihbench.api import load_scene
 from ihbench.data_source import standin_root
 from ihbench.errors import BadInput
-from ihbench.predictions import find_alpha, find_predictions, read_image
+from ihbench.files.images import read_image
+from ihbench.predictions import find_alpha, find_predictions
 from ihbench.prepared import read_prepared
 from ihbench.progress import Progress
 from ihbench.views import TestViewKey, open_scene

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from ihbench.body import CANONICAL_POSES, JOINT_INDEX, canonical_pose, load_body
+from ihbench.body.pose import BodyPose
 from ihbench.errors import BadInput
-from ihbench.scene import BodyPose
 
 
 def joint(pose_name: str, joint_name: str) -> np.ndarray:

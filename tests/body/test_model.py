@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ihbench.body import JOINT_NAMES, PARENTS, PART_PALETTE, load_body, skinning_numpy
+from ihbench.body.pose import BodyPose
 from ihbench.errors import BadInput
-from ihbench.scene import BodyPose
 
 POSE = np.random.default_rng(0).normal(0, 0.4, (24, 3))
 BETAS = np.random.default_rng(1).normal(0, 1, 10)

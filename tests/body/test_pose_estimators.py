@@ -8,6 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from ihbench.body import load_body, zju_root
+from ihbench.body.pose import BodyPose
 from ihbench.body.pose_estimators import (
     from_camera_space,
     from_easymocap,
@@ -20,7 +21,6 @@ from ihbench.body.pose_estimators import (
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import look_at
 from ihbench.errors import BadInput
-from ihbench.scene import BodyPose
 
 WIDTH, HEIGHT = 1280, 720
 K = np.array([[1000.0, 0, 640], [0, 1010, 360], [0, 0, 1]])

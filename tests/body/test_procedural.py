@@ -4,9 +4,9 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from ihbench.body import JOINT_INDEX, load_body, procedural
+from ihbench.body.pose import BodyPose
 from ihbench.body.procedural_surface import signed_distance
 from ihbench.body.smpl_file import PROCEDURAL_FILE
-from ihbench.scene import BodyPose
 
 MIRROR = np.array([-1, 1, 1])
 

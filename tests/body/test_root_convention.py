@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ihbench.body import Body, from_zju_root, load_body, zju_root
+from ihbench.body.pose import BodyPose
 from ihbench.errors import BadInput
-from ihbench.scene import BodyPose
 
 
 def off_centre_body() -> Body:

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from ihbench.body import chart_padding, load_body, position_map, sample_uv, texel_table
+from ihbench.body.pose import BodyPose
 from ihbench.body.uv import grid_sample_coordinates, map_coordinates
-from ihbench.scene import BodyPose
 
 
 def padded(values: np.ndarray, index: np.ndarray) -> np.ndarray:

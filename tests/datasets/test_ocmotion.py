@@ -17,13 +17,13 @@ from scipy.spatial.transform import Rotation
 
 from ihbench import atomic
 from ihbench.body import load_body
+from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera, look_at
 from ihbench.datasets import ocmotion, ocmotion_w2a
 from ihbench.datasets.ocmotion import AnnotFrame, AnnotPerson, OcMotionOriginal
 from ihbench.datasets.ocmotion_w2a import OcMotionW2a
 from ihbench.errors import BadInput
 from ihbench.render.zbuffer import rasterize
-from ihbench.scene import BodyPose
 
 WIDTH, HEIGHT = 128, 96
 NAME = "0011_02_1_w2a"

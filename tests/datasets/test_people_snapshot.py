@@ -19,13 +19,13 @@ from scipy.ndimage import binary_closing
 
 from ihbench import atomic
 from ihbench.body import load_body
+from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.datasets import gaussianavatar, instantavatar, people_snapshot
 from ihbench.datasets.gaussianavatar import GaussianAvatar
 from ihbench.datasets.instantavatar import InstantAvatar
 from ihbench.datasets.people_snapshot import PeopleSnapshotRaw
 from ihbench.errors import BadInput
-from ihbench.scene import BodyPose
 
 WIDTH, HEIGHT, N = 48, 64, 8
 SUBJECT = "male-3-casual"

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from ihbench import atomic
 from ihbench.body import load_body
+from ihbench.body.pose import BodyPose
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera, look_at
 from ihbench.commands import data
@@ -25,7 +26,6 @@ from ihbench.datasets import plain_scene
 from ihbench.datasets.plain_scene import PlainScene, read_cameras, read_poses
 from ihbench.errors import BadInput
 from ihbench.render.zbuffer import rasterize
-from ihbench.scene import BodyPose
 
 WIDTH, HEIGHT = 64, 48
 FRAMES = [3, 4, 10]

@@ -9,11 +9,11 @@ from PIL import Image, ImageFilter
 from scipy.spatial.transform import Rotation
 
 from ihbench.body import load_body
+from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.datasets import plain_scene
 from ihbench.datasets.plausibility import absurd_camera, suspicious_camera
 from ihbench.render.zbuffer import rasterize
-from ihbench.scene import BodyPose
 
 WIDTH, HEIGHT, FRAMES = 96, 128, 14
 ROWS = np.arange(HEIGHT)[:, None]

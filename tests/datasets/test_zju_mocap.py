@@ -13,11 +13,11 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from ihbench.body import load_body
+from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera, look_at
 from ihbench.datasets import zju_mocap
 from ihbench.datasets.zju_mocap import ZjuMocap
 from ihbench.errors import BadInput
-from ihbench.scene import BodyPose
 
 WIDTH, HEIGHT = 64, 48
 N_CAMERAS, N_FRAMES = 2, 3

@@ -11,8 +11,8 @@ import pytest
 from PIL import Image, ImageCms, PngImagePlugin
 
 from ihbench.errors import BadInput
+from ihbench.files.images import read_image
 from ihbench.files.pictures import encoded, read_mask, read_picture, read_rgb, size_of
-from ihbench.predictions import read_image
 
 RGB = np.random.default_rng(0).integers(1, 255, (6, 5, 3)).astype(np.uint8)
 GREY = RGB[..., 0]

@@ -18,6 +18,7 @@ from PIL import Image
 
 from ihbench import atomic, registry
 from ihbench.body import load_body
+from ihbench.body.pose import BodyPose
 from ihbench.body.smpl_file import read_arrays, write_body
 from ihbench.body.uv_obj import read_uv_obj
 from ihbench.datasets import gaussianavatar, instantavatar, ocmotion_w2a, people_snapshot, plain_scene
@@ -25,13 +26,12 @@ from ihbench.datasets import zju_mocap as zju
 from ihbench.datasets.pickles import write_pickle
 from ihbench.datasets.standin_mark import STANDIN_FILE, standin_mark
 from ihbench.errors import BadInput
+from ihbench.files.images import read_image
 from ihbench.ledger import Ledger
-from ihbench.predictions import read_image
 from ihbench.protocol import read_protocol
 from ihbench.reports.paper_numbers import paper_table
 from ihbench.reports.table_reading import read_tables
 from ihbench.safe_pickle import load_npy, load_pickle
-from ihbench.scene import BodyPose
 from tests.bench.fake_capture import a_camera, a_pose
 from tests.fuzz.patience import TooLong, at_most
 

@@ -10,14 +10,15 @@ from scipy.ndimage import binary_erosion, distance_transform_edt, maximum_filter
 from scipy.spatial.transform import Rotation
 
 from ihbench.body import CANONICAL_POSES, canonical_pose
+from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.errors import BadInput
 from ihbench.methods.inpainthuman.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.config import QUICK
 from ihbench.methods.inpainthuman.decoder import GaussianDecoder, positional_encoding, scale_factor
 from ihbench.methods.inpainthuman.method import InpaintHuman
-from ihbench.render.splat import LOW_PASS, render_gaussians
-from ihbench.scene import BodyPose
+from ihbench.render.splat import render_gaussians
+from ihbench.render.splats import LOW_PASS
 from ihbench.threads import one_torch_thread
 from tests.bench.fake_capture import DISTANCE, WHITE, a_camera, a_pose, rasterized, the_body
 

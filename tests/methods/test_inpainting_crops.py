@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from ihbench.body import load_body
+from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera, look_at
 from ihbench.methods.inpainthuman.inpainting.block_transform import BlockTransform
 from ihbench.methods.inpainthuman.inpainting.crop_view import cut_view
@@ -23,7 +24,7 @@ from ihbench.methods.inpainthuman.inpainting.part_map import (
 from ihbench.methods.inpainthuman.inpainting.person_crop import PersonCrop, person_crop
 from ihbench.methods.inpainthuman.inpainting.push_pull import push_pull
 from ihbench.methods.inpainthuman.inpainting.random_mask import KINDS, random_mask
-from ihbench.scene import BodyPose, MaskState, TrainView
+from ihbench.scene import MaskState, TrainView
 
 STANDING = BodyPose(np.zeros((24, 3)), np.zeros(10), np.zeros(3))
 

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from ihbench.camera import Camera
-from ihbench.render.splat import ALPHA_MAX, ALPHA_MIN, LOW_PASS, NEAR, render_gaussians
+from ihbench.render.splat import render_gaussians
+from ihbench.render.splats import ALPHA_MAX, ALPHA_MIN, LOW_PASS, NEAR
 
 CPU_BACKENDS = ("reference", "numba")
 both = pytest.mark.parametrize("backend", CPU_BACKENDS)

@@ -12,7 +12,8 @@ import torch
 
 from ihbench.errors import BadInput
 from ihbench.render import splat_gsplat
-from ihbench.render.splat import ALPHA_MAX, ALPHA_MIN, render_gaussians
+from ihbench.render.splat import render_gaussians
+from ihbench.render.splats import ALPHA_MAX, ALPHA_MIN
 from tests.render.test_splat import front_camera, random_gaussians
 
 

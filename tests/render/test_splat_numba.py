@@ -12,7 +12,8 @@ import torch
 
 from ihbench.kernels.splats import Gaussians, body_gaussians, compare_with_twin
 from ihbench.render import splat_numba, splat_reference
-from ihbench.render.splat import Splats, render_gaussians
+from ihbench.render.splat import render_gaussians
+from ihbench.render.splats import Splats
 from tests.render.test_splat import front_camera, random_gaussians
 
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from ihbench.render.splat import ALPHA_MAX, ALPHA_MIN, LOW_PASS, Splats, project_gaussians, render_gaussians
+from ihbench.render.splat import project_gaussians, render_gaussians
 from ihbench.render.splat_reference import alphas_near_threshold, composite
+from ihbench.render.splats import ALPHA_MAX, ALPHA_MIN, LOW_PASS, Splats
 from tests.render.test_splat import front_camera, random_gaussians
 
 

@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ihbench.body import Body
+from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.methods.inpainthuman.inpainting.surface_need import SeenSurface, pixels_of
-from ihbench.scene import BodyPose, MaskState, TrainingSet, TrainView
+from ihbench.scene import MaskState, TrainingSet, TrainView
 
 Background = tuple[float, float, float]
 
