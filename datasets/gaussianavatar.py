@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench import atomic
 from ihbench.body import Body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
@@ -42,10 +41,11 @@ from ihbench.datasets.people_snapshot import (
     subject_folders,
 )
 from ihbench.errors import BadInput
+from ihbench.files import atomic
+from ihbench.files.paths import user_path
 from ihbench.files.pictures import encoded, read_mask, read_rgb, size_of
 from ihbench.files.spelling import missing_file
 from ihbench.files.tensors import read_tensors
-from ihbench.paths import user_path
 
 SPLITS = ("train", "test")
 IMAGES, MASKS, CAMERA, POSES = "images", "masks", "cam_parms", "smpl_parms.pth"

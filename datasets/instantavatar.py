@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench import atomic
 from ihbench.body import Body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
@@ -43,10 +42,11 @@ from ihbench.datasets.people_snapshot import (
     subject_folders,
 )
 from ihbench.errors import BadInput
+from ihbench.files import atomic
+from ihbench.files.paths import user_path
 from ihbench.files.pictures import above_half, encoded, read_rgb
+from ihbench.files.safe_pickle import load_npy
 from ihbench.files.spelling import missing_file
-from ihbench.paths import user_path
-from ihbench.safe_pickle import load_npy
 
 CAMERA_FILE, POSES_FILE = "cameras.npz", "poses.npz"
 REFINED = {"train": "poses/anim_nerf_train.npz", "test": "poses/anim_nerf_test.npz"}

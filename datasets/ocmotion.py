@@ -27,7 +27,6 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench import atomic
 from ihbench.body import Body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera, off_orthogonal
@@ -35,11 +34,12 @@ from ihbench.datasets.capture_folder import BY_OPTIONS, CaptureFolder
 from ihbench.datasets.pickles import write_pickle
 from ihbench.datasets.plausibility import Outline, examine
 from ihbench.errors import BadInput
+from ihbench.files import atomic
+from ihbench.files.paths import user_path
 from ihbench.files.pictures import encoded, read_mask, read_rgb, size_of
+from ihbench.files.safe_pickle import load_pickle
 from ihbench.files.spelling import missing_file
-from ihbench.paths import user_path
 from ihbench.registry import nearest
-from ihbench.safe_pickle import load_pickle
 
 Array = NDArray[np.float64]
 

@@ -24,7 +24,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench import atomic
 from ihbench.body import Body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
@@ -42,12 +41,13 @@ from ihbench.datasets.ocmotion import (
 )
 from ihbench.datasets.pickles import write_pickle
 from ihbench.errors import BadInput
+from ihbench.files import atomic
+from ihbench.files.paths import user_path
 from ihbench.files.pictures import encoded, one_line
 from ihbench.files.regular import read_text
+from ihbench.files.safe_pickle import load_pickle
 from ihbench.files.spelling import missing_file
-from ihbench.paths import user_path
 from ihbench.registry import nearest
-from ihbench.safe_pickle import load_pickle
 
 Array = NDArray[np.float64]
 

@@ -28,7 +28,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench import atomic
 from ihbench.body import Body
 from ihbench.body.pose import BodyPose
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
@@ -37,12 +36,12 @@ from ihbench.datasets.capture_folder import BY_OPTIONS, CaptureFolder
 from ihbench.datasets.pickles import write_pickle
 from ihbench.datasets.plausibility import Outline, examine, share_inside
 from ihbench.errors import BadInput
-from ihbench.files import npz
+from ihbench.files import atomic, npz
+from ihbench.files.paths import user_path
 from ihbench.files.pictures import above_half, one_line
+from ihbench.files.safe_pickle import load_pickle
 from ihbench.files.spelling import missing_file
-from ihbench.paths import user_path
 from ihbench.registry import nearest
-from ihbench.safe_pickle import load_pickle
 
 if TYPE_CHECKING:
     import h5py

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from ihbench import atomic
+from ihbench.files import atomic
 
 
 def write_object(path: Path, value: dict[str, Any]) -> None:
-    """A dictionary as np.save would write it; `ihbench.safe_pickle.load_npy` reads it."""
+    """A dictionary as np.save would write it; `ihbench.files.safe_pickle.load_npy` reads it."""
     buffer = io.BytesIO()
     np.lib.format.write_array_header_1_0(buffer, {"descr": "|O", "fortran_order": False, "shape": ()})
     buffer.write(_pickled(np.array(value, dtype=object)))
@@ -21,7 +21,7 @@ def write_object(path: Path, value: dict[str, Any]) -> None:
 
 
 def write_pickle(path: Path, value: Any) -> None:
-    """Plain values and numpy arrays as a pickle; `ihbench.safe_pickle.load_pickle` reads it."""
+    """Plain values and numpy arrays as a pickle; `ihbench.files.safe_pickle.load_pickle` reads it."""
     atomic.write_bytes(path, _pickled(value), durable=False)
 
 

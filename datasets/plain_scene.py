@@ -25,7 +25,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench import atomic
 from ihbench.body import Body, from_zju_root, load_body, write_body, zju_root
 from ihbench.body.pose import BodyPose
 from ihbench.body.skeleton import pose_hint
@@ -35,10 +34,11 @@ from ihbench.datasets.capture_folder import CaptureFolder
 from ihbench.datasets.plausibility import SOFT_VALUES, Outline, examine
 from ihbench.datasets.standin_mark import STANDIN_FILE
 from ihbench.errors import BadInput, BadValue
+from ihbench.files import atomic
 from ihbench.files.npz import read_npz
+from ihbench.files.paths import user_path
 from ihbench.files.pictures import encoded, one_line, read_mask, read_rgb
 from ihbench.files.spelling import as_stored, missing_file, same_name
-from ihbench.paths import user_path
 from ihbench.registry import nearest
 
 Array = NDArray[np.float64]

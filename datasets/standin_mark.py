@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ihbench import atomic
 from ihbench.errors import BadInput
+from ihbench.files import atomic
 
 STANDIN_FILE = "STANDIN.json"  # in the folder that holds the subjects
 

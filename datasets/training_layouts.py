@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ihbench import atomic
 from ihbench.datasets import gaussianavatar, humannerf, instantavatar, ocmotion_w2a, zju_mocap, zju_refine
+from ihbench.files import atomic
 from ihbench.files.pictures import encoded
 from ihbench.prepare import Handout
 

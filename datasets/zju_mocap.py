@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench import atomic
 from ihbench.body import Body, from_zju_root, zju_root
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera, off_orthogonal
@@ -31,11 +30,12 @@ from ihbench.datasets.capture_folder import BY_OPTIONS, CaptureFolder
 from ihbench.datasets.pickles import write_object
 from ihbench.datasets.plausibility import Outline, examine
 from ihbench.errors import BadInput
+from ihbench.files import atomic
+from ihbench.files.paths import user_path
 from ihbench.files.pictures import encoded, read_mask, read_rgb, size_of
+from ihbench.files.safe_pickle import load_npy
 from ihbench.files.spelling import missing_file
-from ihbench.paths import user_path
 from ihbench.registry import nearest
-from ihbench.safe_pickle import load_npy
 
 FOLDER_PREFIX = "CoreView_"
 FITS = ("new_params", "params")  # the newer one first: HumanNeRF and OccNeRF use it

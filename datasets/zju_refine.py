@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench import atomic
 from ihbench.body import Body
 from ihbench.datasets import zju_mocap
 from ihbench.datasets.zju_mocap import ZjuCapture, ZjuMocap
 from ihbench.errors import BadInput
+from ihbench.files import atomic
 from ihbench.files.pictures import encoded
 
 PREFIX = "my_"

@@ -20,7 +20,7 @@ from ihbench.commands.device import check_device
 from ihbench.commands.keep import check_keep
 from ihbench.commands.scene_choice import OcclusionChoice, ProtocolChanges
 from ihbench.errors import BadInput
-from ihbench.paths import user_path
+from ihbench.files.paths import user_path
 from ihbench.progress import Progress
 from ihbench.protocol import Protocol, load_protocol
 from ihbench.results import RunResult

@@ -19,8 +19,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from ihbench import removal
 from ihbench.errors import BadInput
+from ihbench.files import removal
 from ihbench.metrics import Mean
 from ihbench.results import RunResult, read_result, without_copies
 from ihbench.store import INDEX, KILLED, OUR_NAME

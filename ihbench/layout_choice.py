@@ -8,7 +8,7 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 from ihbench.errors import BadInput
-from ihbench.paths import user_path
+from ihbench.files.paths import user_path
 from ihbench.scene import Dataset
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ihbench import interruption, machine
-from ihbench.atomic import decode, encode, write_bytes
+from ihbench.files.atomic import decode, encode, write_bytes
 from ihbench.files.regular import read_bytes
 
 if TYPE_CHECKING:

@@ -14,8 +14,8 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from ihbench import atomic, removal
 from ihbench.errors import BadInput
+from ihbench.files import atomic, removal
 from ihbench.store import INDEX, is_record
 
 LIST = ".ihbench-written.json"

@@ -29,9 +29,9 @@ from numpy.typing import NDArray
 from ihbench import registry
 from ihbench.errors import BadInput
 from ihbench.files.images import ALPHAS, read_channels, read_image
+from ihbench.files.name_pattern import NamePattern
 from ihbench.files.pictures import Header, header_of
 from ihbench.metrics.images import Color
-from ihbench.name_pattern import NamePattern
 from ihbench.views import TestViewKey
 
 DEFAULT_PATTERNS = ("{scene}/{camera}/{frame:06d}.png", "{camera}/{frame:06d}.png")

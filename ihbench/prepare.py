@@ -21,11 +21,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench import atomic, locks, registry, removal
+from ihbench import registry
 from ihbench.body import Body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.errors import BadInput
+from ihbench.files import atomic, locks, removal
 from ihbench.progress import Progress
 from ihbench.scene import MaskState, TrainView
 from ihbench.version import __version__

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ihbench import atomic, registry
+from ihbench import registry
 from ihbench.data_source import DataSource, locate, own_data, standin_root
 from ihbench.errors import BadInput
+from ihbench.files import atomic
 from ihbench.prepare import MANIFEST
 from ihbench.protocol import Protocol, protocol_from
 from ihbench.scene import Capture

@@ -15,8 +15,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
-from ihbench import atomic
 from ihbench.errors import BadInput
+from ihbench.files import atomic
 from ihbench.files.regular import read_bytes
 from ihbench.metrics.identity import Identity as MetricIdentity
 from ihbench.shape import WHOLE, Matches, Within, fault

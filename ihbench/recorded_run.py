@@ -10,9 +10,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from ihbench import atomic, machine, removal
+from ihbench import machine
 from ihbench.errors import BadInput, Diverged
 from ihbench.failures import one_line
+from ihbench.files import atomic, removal
 from ihbench.interruption import asked, interruptible, reason_of, undisturbed
 from ihbench.ledger import Ledger, OnCheckpoint
 from ihbench.progress import Progress

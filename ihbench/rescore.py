@@ -11,8 +11,8 @@ from pathlib import Path
 
 from numpy.typing import NDArray
 
-from ihbench import atomic
 from ihbench.errors import BadInput
+from ihbench.files import atomic
 from ihbench.files.images import read_image
 from ihbench.metrics.evaluate import Preset, find_preset
 from ihbench.progress import Progress

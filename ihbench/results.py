@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ihbench import atomic
 from ihbench.errors import BadInput
+from ihbench.files import atomic
 from ihbench.metrics import Mean, Score, mean_over_frames
 from ihbench.record import curve_points, outcome_fault, preset_lines, score_lines
 from ihbench.store import RunFolder

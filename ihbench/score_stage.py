@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench import atomic
 from ihbench.calibration import ROWS, Calibration
 from ihbench.contact_sheet import SheetRow, contact_sheet
 from ihbench.errors import BadInput
+from ihbench.files import atomic
 from ihbench.files.images import write_png
 from ihbench.metrics.eight_bit import rounded
 from ihbench.progress import Progress

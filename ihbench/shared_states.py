@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ihbench import atomic
 from ihbench.errors import BadInput
+from ihbench.files import atomic
 from ihbench.store import RunFolder
 
 SAME_CLOCK = ("cpu", "gpu", "torch_threads")  # of a machine's identity: the state's seconds come with it

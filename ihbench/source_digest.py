@@ -35,7 +35,7 @@ NOT_IN_NUMBERS = (
     *(f"{room}/*" for room in registry.ROOMS),
     "commands/*", "kernels/*", "stress/*", "__main__.py", "cli.py", "progress.py", "errors.py", "registry.py",
     "ablation.py", "cells.py", "earlier_runs.py", "index.py", "quality_time.py",
-    "contact_sheet.py", "diagram.py", "splat_ply.py", "row_choice.py", "row_labels.py",
+    "contact_sheet.py", "diagram.py", "files/splat_ply.py", "row_choice.py", "row_labels.py",
     "api.py", "repeat.py", "gpu_slots.py", "failures.py", "streams.py",
     "machine.py", "provenance.py", "threads.py",
     "metrics/check.py", "metrics/cases.py", "metrics/*oracle.py", "metrics/reference_values.py",

@@ -24,8 +24,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, get_args
 
-from ihbench import atomic, locks, machine, removal
+from ihbench import machine
 from ihbench.errors import BadInput
+from ihbench.files import atomic, locks, removal
 from ihbench.interruption import undisturbed
 from ihbench.ledger import Ledger, is_saved_state
 from ihbench.provenance import provenance

@@ -14,9 +14,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from ihbench import atomic, registry
+from ihbench import registry
 from ihbench.errors import BadInput
-from ihbench.paths import path_from, users_cache
+from ihbench.files import atomic
+from ihbench.files.paths import path_from, users_cache
 from ihbench.progress import Progress
 
 CHUNK = 2**20  # bytes

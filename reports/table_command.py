@@ -8,9 +8,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from ihbench import atomic, outputs
+from ihbench import outputs
 from ihbench.commands.parse import options
 from ihbench.errors import BadInput
+from ihbench.files import atomic
 
 if TYPE_CHECKING:
     from ihbench.results import RunResult

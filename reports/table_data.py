@@ -8,8 +8,8 @@ import json
 import math
 from typing import Any
 
-from ihbench import atomic
 from ihbench.diagram import harmless
+from ihbench.files import atomic
 from ihbench.reports.paper_table import Block, Cell, Frame, Row
 
 FIELDS: tuple[str, ...] = (

@@ -7,13 +7,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from ihbench import atomic
 from ihbench.body import Body, load_body
 from ihbench.datasets.standin.subject import Subject
 from ihbench.datasets.standin_mark import STANDIN_FILE
 from ihbench.errors import BadInput
-from ihbench.locks import locked
-from ihbench.paths import user_path
+from ihbench.files import atomic
+from ihbench.files.locks import locked
+from ihbench.files.paths import user_path
 from ihbench.progress import Progress
 
 NAME_PREFIX = "standin-"

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ihbench import atomic
 from ihbench.camera import Camera, look_at
 from ihbench.datasets import ocmotion_w2a
 from ihbench.datasets.standin import motion
@@ -23,6 +22,7 @@ from ihbench.datasets.standin.furniture import furnish, furniture_view
 from ihbench.datasets.standin.photograph import photograph
 from ihbench.datasets.standin.studio import empty_studio
 from ihbench.datasets.standin.subject import Subject
+from ihbench.files import atomic
 from ihbench.files.pictures import encoded
 from ihbench.progress import Progress
 

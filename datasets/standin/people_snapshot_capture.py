@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench import atomic
 from ihbench.body.pose import BodyPose
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera, look_at
@@ -24,6 +23,7 @@ from ihbench.datasets.standin.cast import alone_with, cast_names, open_cast
 from ihbench.datasets.standin.photograph import Photograph, photograph
 from ihbench.datasets.standin.studio import empty_studio
 from ihbench.datasets.standin.subject import Subject
+from ihbench.files import atomic
 from ihbench.files.pictures import encoded
 from ihbench.progress import Progress
 

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench import atomic
 from ihbench.body.pose_estimators import from_easymocap
 from ihbench.camera import Camera
 from ihbench.errors import BadInput
+from ihbench.files import atomic
 
 if TYPE_CHECKING:
     from ihbench.body.model import Body

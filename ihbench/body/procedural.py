@@ -20,10 +20,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench import atomic
 from ihbench.body.atlas import part_atlas
 from ihbench.body.procedural_surface import build_mesh
 from ihbench.body.skeleton import JOINT_INDEX, JOINT_NAMES, PARENTS
+from ihbench.files import atomic
 
 Array = NDArray[np.float64]
 

@@ -15,15 +15,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench import atomic
 from ihbench.body.atlas import part_atlas
 from ihbench.body.model import Body
 from ihbench.body.skeleton import PARENTS
 from ihbench.body.uv_obj import read_uv_obj
 from ihbench.errors import BadInput
+from ihbench.files import atomic
 from ihbench.files.npz import read_npz
-from ihbench.paths import user_path
-from ihbench.safe_pickle import ForeignObject, load_pickle
+from ihbench.files.paths import user_path
+from ihbench.files.safe_pickle import ForeignObject, load_pickle
 
 PROCEDURAL_FILE = Path(__file__).with_name("procedural_body.npz")
 WHERE_SMPL_IS = (

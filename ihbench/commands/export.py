@@ -38,9 +38,9 @@ def main(argv: list[str]) -> int:
     import numpy as np
 
     from ihbench import outputs
-    from ihbench.atomic import is_stream
+    from ihbench.files.atomic import is_stream
+    from ihbench.files.splat_ply import UPRIGHT, VIEWER_TURN, write_splat_ply
     from ihbench.run_loop import load_avatar
-    from ihbench.splat_ply import UPRIGHT, VIEWER_TURN, write_splat_ply
 
     outputs.check_file(chosen.out, chosen.data, chosen.body)
     avatar, open_capture = load_avatar(chosen.run, chosen.data, chosen.body)
@@ -77,8 +77,8 @@ def _for_viewers(means: Any, pose: Any, avatar: Any, chosen: ExportOptions) -> A
     """[N, 3] m, upright about the pelvis of the avatar's own body."""
     from ihbench.body.pose import BodyPose
     from ihbench.body.skinning_numpy import axis_angle_to_matrix
+    from ihbench.files.splat_ply import in_viewer_axes
     from ihbench.reopen import reopen_body
-    from ihbench.splat_ply import in_viewer_axes
 
     body = getattr(avatar, "body", None) or reopen_body(chosen.run, chosen.data, chosen.body)
     pelvis = body.posed_joints(BodyPose(pose.pose, avatar.betas, pose.transl))[0]

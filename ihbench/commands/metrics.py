@@ -39,7 +39,7 @@ def main(argv: list[str]) -> int:
     found = check(examples=chosen.lpips_examples)
     wrong = mismatches(found)
     if chosen.json:
-        from ihbench.atomic import encode
+        from ihbench.files.atomic import encode
 
         rows = [asdict(c) | {"difference": c.difference, "ok": c.ok} for c in found]
         print(json.dumps(encode({"ok": not wrong, "comparisons": rows}), allow_nan=False))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from ihbench import bounds, streams
 from ihbench.errors import BadInput
-from ihbench.paths import user_path
+from ihbench.files.paths import user_path
 
 if TYPE_CHECKING:
     from tyro.constructors import ConstructorRegistry

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from ihbench import atomic, outputs, registry
+from ihbench import outputs, registry
 from ihbench.commands.parse import options
 from ihbench.errors import BadInput, visible
+from ihbench.files import atomic
 
 if TYPE_CHECKING:
     from ihbench.results import RunResult

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from ihbench import atomic, registry
+from ihbench import registry
 from ihbench.commands.parse import options
 from ihbench.errors import BadInput
+from ihbench.files import atomic
 
 if TYPE_CHECKING:
     from ihbench.results import RunResult

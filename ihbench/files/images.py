@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench.atomic import write_bytes
 from ihbench.errors import BadInput
+from ihbench.files.atomic import write_bytes
 from ihbench.files.pictures import encoded, read_picture
-from ihbench.safe_pickle import load_npy
+from ihbench.files.safe_pickle import load_npy
 
 ALPHAS = ("straight", "premultiplied", "composited")
 

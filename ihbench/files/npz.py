@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ihbench.errors import BadInput
 from ihbench.files.regular import opened
-from ihbench.safe_pickle import read_npy_header
+from ihbench.files.safe_pickle import read_npy_header
 
 LARGEST = 2**31  # bytes of all arrays that are read
 PLAIN = "biufcSU"  # kinds of dtypes: numbers, truth values and text

@@ -19,7 +19,7 @@ UNITS = {"ulp": "ulp", "relative": "rel", "absolute": "abs", "at most": "over", 
 def as_json(outcomes: Sequence[Outcome], seconds: float, processor_seconds: float) -> str:
     """One strict JSON object {"ok", "seconds", …, "machine", "cases": […]}; NaN and infinities as in `atomic`."""
     from ihbench import machine
-    from ihbench.atomic import encode
+    from ihbench.files.atomic import encode
 
     found = {
         "ok": not failures(outcomes),

@@ -199,7 +199,7 @@ class GaussianAvatar(nn.Module):
         """
         from safetensors.torch import save
 
-        from ihbench.atomic import write_bytes, write_json
+        from ihbench.files.atomic import write_bytes, write_json
 
         state = {k: v.detach().cpu().contiguous() for k, v in self.state_dict().items()}
         write_bytes(folder / "avatar.safetensors", save(state))
@@ -220,7 +220,7 @@ class GaussianAvatar(nn.Module):
         from safetensors import SafetensorError
         from safetensors.torch import load
 
-        from ihbench.atomic import read_json
+        from ihbench.files.atomic import read_json
         from ihbench.files.regular import read_bytes
 
         try:

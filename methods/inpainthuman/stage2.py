@@ -149,7 +149,7 @@ class Stage2:
             flicker=flicker([filmed[k] for k in in_time], [painted[k] for k in in_time], body),
         )
         if self.ledger.folder is not None:
-            from ihbench.atomic import write_bytes
+            from ihbench.files.atomic import write_bytes
             from ihbench.methods.inpainthuman.inpainting.grid import painted_grid, png
 
             write_bytes(self.ledger.folder / "inpainting.png", png(painted_grid(views, painted, silhouettes)))

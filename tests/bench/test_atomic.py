@@ -17,8 +17,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ihbench import atomic
 from ihbench.errors import BadInput
+from ihbench.files import atomic
 
 
 def names(folder: Path) -> list[str]:

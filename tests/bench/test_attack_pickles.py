@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 from ihbench.errors import BadInput
-from ihbench.safe_pickle import ForeignObject, load_npy, load_pickle
+from ihbench.files.safe_pickle import ForeignObject, load_npy, load_pickle
 
 # ------------------------------------------------------------------------------- pieces of pickle programs
 
@@ -646,7 +646,7 @@ def test_the_worst_ones_within_a_gigabyte(tmp_path):
     code = f"""
         import resource, sys
         from ihbench.errors import BadInput
-        from ihbench.safe_pickle import load_pickle
+        from ihbench.files.safe_pickle import load_pickle
         resource.setrlimit(resource.RLIMIT_AS, ({2**30}, {2**30}))
         for file in sys.argv[1:]:
             try:

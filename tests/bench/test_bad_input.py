@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ihbench import data_source, locks
-from ihbench.atomic import read_json
+from ihbench import data_source
+from ihbench.files import locks
+from ihbench.files.atomic import read_json
 from ihbench.ledger import Ledger
 from ihbench.results import read_result
 from ihbench.store import RunFolder

@@ -9,7 +9,7 @@ import pytest
 from ihbench.bounds import MultipleOf, Within, check
 from ihbench.commands.parse import options
 from ihbench.errors import BadInput
-from ihbench.paths import user_path
+from ihbench.files.paths import user_path
 
 
 @dataclass(frozen=True)

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from ihbench import registry
-from ihbench.atomic import read_json, read_json_lines
 from ihbench.body.canonical import canonical_pose
 from ihbench.body.pose import BodyPose
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.data_source import standin_root
+from ihbench.files.atomic import read_json, read_json_lines
+from ihbench.files.splat_ply import read_splat_ply
 from ihbench.results import read_result
 from ihbench.run_loop import load_avatar
-from ihbench.splat_ply import read_splat_ply
 from tests.conftest import contents, tiny_protocol
 
 BODY_PSNR = "psnr/pooled/range1/body/v1"

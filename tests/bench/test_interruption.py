@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from ihbench import interruption
-from ihbench.atomic import read_json
 from ihbench.errors import BadInput
+from ihbench.files.atomic import read_json
 from ihbench.index import Index
 from ihbench.interruption import Terminated, interruptible, undisturbed
 from ihbench.progress import Progress

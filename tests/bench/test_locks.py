@@ -15,9 +15,9 @@ from contextlib import nullcontext
 
 import pytest
 
-from ihbench import locks
 from ihbench.errors import BadInput
-from ihbench.locks import is_held, locked
+from ihbench.files import locks
+from ihbench.files.locks import is_held, locked
 
 # errors of network file systems, of old container ones, of some FUSE ones; and a system that has locks
 KINDS = [0, errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP]
@@ -25,7 +25,7 @@ WITHOUT = (
     "import errno, fcntl, os\ndef refuse(*_): raise OSError({number}, os.strerror({number}))\nfcntl.flock = refuse\n"
 )
 HOLD = (
-    "import sys, time; from pathlib import Path; from ihbench.locks import locked\n"
+    "import sys, time; from pathlib import Path; from ihbench.files.locks import locked\n"
     "with locked(Path(sys.argv[1]), ''):\n"
     "    print('held', flush=True); sys.stdin.read()"
 )

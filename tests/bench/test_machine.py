@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ihbench import atomic, machine, provenance
+from ihbench import machine, provenance
+from ihbench.files import atomic
 
 
 def test_identity_is_complete_and_fits_into_json():

@@ -9,9 +9,10 @@ import sys
 
 import pytest
 
-from ihbench import atomic, diagram, outputs
+from ihbench import diagram, outputs
 from ihbench.cli import main
 from ihbench.errors import BadInput
+from ihbench.files import atomic
 from tests.conftest import contents
 
 

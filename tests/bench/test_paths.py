@@ -10,7 +10,7 @@ import pytest
 from ihbench.datasets.plain_scene import PlainScene
 from ihbench.datasets.zju_mocap import ZjuMocap
 from ihbench.errors import BadInput
-from ihbench.paths import user_path
+from ihbench.files.paths import user_path
 
 
 def test_what_a_shell_would_make_of_it(tmp_path, monkeypatch):

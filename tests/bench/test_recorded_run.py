@@ -7,8 +7,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from ihbench import atomic, machine
+from ihbench import machine
 from ihbench.errors import BadInput
+from ihbench.files import atomic
 from ihbench.progress import Progress
 from ihbench.recorded_run import RecordedRun, recorded
 from ihbench.store import RunFolder

@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ihbench import locks, removal, store
+from ihbench import store
 from ihbench.cli import main
 from ihbench.errors import BadInput
+from ihbench.files import locks, removal
 from ihbench.ledger import Ledger
 from ihbench.prepare import prepare
 from ihbench.progress import Progress
@@ -48,10 +49,10 @@ def test_only_one_module_removes():
                 if name:
                     found.setdefault(path.relative_to(ROOT).as_posix(), set()).add(name)
     assert found == {
-        "ihbench/atomic.py": {"os.replace"},
-        "ihbench/locks.py": {"os.rename", "unlink"},
+        "ihbench/files/atomic.py": {"os.replace"},
+        "ihbench/files/locks.py": {"os.rename", "unlink"},
         "ihbench/prepare.py": {"os.rename", "rmdir"},
-        "ihbench/removal.py": {"os.replace", "rmdir", "shutil.rmtree", "unlink"},
+        "ihbench/files/removal.py": {"os.replace", "rmdir", "shutil.rmtree", "unlink"},
         "ihbench/store.py": {"os.rename", "rmdir"},
     }
 

@@ -7,7 +7,7 @@ import shutil
 import pytest
 
 from ihbench import provenance, registry
-from ihbench.atomic import read_json, write_json
+from ihbench.files.atomic import read_json, write_json
 from ihbench.store import RunIdentity
 from tests.conftest import contents
 

@@ -8,7 +8,7 @@ from textwrap import dedent
 import pytest
 
 from ihbench import bounds, registry
-from ihbench.atomic import read_json, read_json_lines
+from ihbench.files.atomic import read_json, read_json_lines
 from ihbench.ledger import Ledger
 from tests.conftest import contents
 

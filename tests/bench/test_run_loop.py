@@ -8,10 +8,11 @@ import pytest
 from PIL import Image
 
 import ihbench
-from ihbench import atomic, registry
-from ihbench.atomic import read_json, read_json_lines
+from ihbench import registry
 from ihbench.calibration import ROWS, Calibration
 from ihbench.data_source import locate
+from ihbench.files import atomic
+from ihbench.files.atomic import read_json, read_json_lines
 from ihbench.methods.inpainthuman.config import QUICK
 from ihbench.metrics import psnr
 from ihbench.progress import Progress

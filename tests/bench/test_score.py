@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ihbench import atomic
 from ihbench.api import load_scene
 from ihbench.data_source import standin_root
 from ihbench.errors import BadInput
+from ihbench.files import atomic
 from ihbench.files.images import read_image
 from ihbench.predictions import find_alpha, find_predictions
 from ihbench.prepared import read_prepared

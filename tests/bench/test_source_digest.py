@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ihbench import atomic, registry, source_digest
+from ihbench import registry, source_digest
 from ihbench.calibration import Calibration
 from ihbench.errors import BadInput
+from ihbench.files import atomic
 from ihbench.ledger import Ledger
 from ihbench.protocol import load_protocol
 from ihbench.shared_states import lender

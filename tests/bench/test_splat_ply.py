@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ihbench.errors import BadInput
-from ihbench.splat_ply import VIEWER_TURN, in_viewer_axes, read_splat_ply, splat_ply, write_splat_ply
+from ihbench.files.splat_ply import VIEWER_TURN, in_viewer_axes, read_splat_ply, splat_ply, write_splat_ply
 
 # the order and names in which the released 3D Gaussian splatting code writes them, without the higher harmonics
 FIELDS = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]

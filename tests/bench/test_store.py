@@ -15,8 +15,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ihbench import locks, store
+from ihbench import store
 from ihbench.errors import BadInput
+from ihbench.files import locks
 from ihbench.ledger import Ledger
 from ihbench.store import RunFolder, RunIdentity
 

@@ -8,9 +8,9 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from ihbench import safe_pickle
 from ihbench.errors import BadInput
-from ihbench.safe_pickle import ForeignObject, load_npy, load_pickle
+from ihbench.files import safe_pickle
+from ihbench.files.safe_pickle import ForeignObject, load_npy, load_pickle
 from tests.body.python2_pickle import Instance, dumps
 
 

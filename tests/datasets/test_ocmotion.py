@@ -15,7 +15,6 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from ihbench import atomic
 from ihbench.body import load_body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera, look_at
@@ -23,6 +22,7 @@ from ihbench.datasets import ocmotion, ocmotion_w2a
 from ihbench.datasets.ocmotion import AnnotFrame, AnnotPerson, OcMotionOriginal
 from ihbench.datasets.ocmotion_w2a import OcMotionW2a
 from ihbench.errors import BadInput
+from ihbench.files import atomic
 from ihbench.render.zbuffer import rasterize
 
 WIDTH, HEIGHT = 128, 96

@@ -17,7 +17,6 @@ import torch
 from PIL import Image
 from scipy.ndimage import binary_closing
 
-from ihbench import atomic
 from ihbench.body import load_body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
@@ -26,6 +25,7 @@ from ihbench.datasets.gaussianavatar import GaussianAvatar
 from ihbench.datasets.instantavatar import InstantAvatar
 from ihbench.datasets.people_snapshot import PeopleSnapshotRaw
 from ihbench.errors import BadInput
+from ihbench.files import atomic
 
 WIDTH, HEIGHT, N = 48, 64, 8
 SUBJECT = "male-3-casual"

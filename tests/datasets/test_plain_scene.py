@@ -15,7 +15,6 @@ import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from ihbench import atomic
 from ihbench.body import load_body
 from ihbench.body.pose import BodyPose
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
@@ -25,6 +24,7 @@ from ihbench.data_source import open_dataset
 from ihbench.datasets import plain_scene
 from ihbench.datasets.plain_scene import PlainScene, read_cameras, read_poses
 from ihbench.errors import BadInput
+from ihbench.files import atomic
 from ihbench.render.zbuffer import rasterize
 
 WIDTH, HEIGHT = 64, 48

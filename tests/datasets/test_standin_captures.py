@@ -141,7 +141,7 @@ def edit_poses(folder, key, change):
 
 
 def camera_without_focal(folder):
-    from ihbench.safe_pickle import load_pickle
+    from ihbench.files.safe_pickle import load_pickle
 
     camera = load_pickle(folder / "camera.pkl")
     del camera["camera_f"]

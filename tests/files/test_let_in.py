@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from ihbench.errors import BadInput
+from ihbench.files.name_pattern import NamePattern
 from ihbench.files.npz import read_npz
 from ihbench.files.regular import read_bytes, read_text, read_toml
 from ihbench.files.tensors import read_tensors
-from ihbench.name_pattern import NamePattern
 
 READERS = {
     "bytes": read_bytes,

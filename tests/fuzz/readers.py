@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from ihbench import atomic, registry
+from ihbench import registry
 from ihbench.body import load_body
 from ihbench.body.pose import BodyPose
 from ihbench.body.smpl_file import read_arrays, write_body
@@ -26,12 +26,13 @@ from ihbench.datasets import zju_mocap as zju
 from ihbench.datasets.pickles import write_pickle
 from ihbench.datasets.standin_mark import STANDIN_FILE, standin_mark
 from ihbench.errors import BadInput
+from ihbench.files import atomic
 from ihbench.files.images import read_image
+from ihbench.files.safe_pickle import load_npy, load_pickle
 from ihbench.ledger import Ledger
 from ihbench.protocol import read_protocol
 from ihbench.reports.paper_numbers import paper_table
 from ihbench.reports.table_reading import read_tables
-from ihbench.safe_pickle import load_npy, load_pickle
 from tests.bench.fake_capture import a_camera, a_pose
 from tests.fuzz.patience import TooLong, at_most
 

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ihbench import atomic
 from ihbench.ablation import Comparison, Ladder, Rung
 from ihbench.cells import Cell, CellOutcome
 from ihbench.cli import main
 from ihbench.earlier_runs import earlier_runs
 from ihbench.errors import BadInput
+from ihbench.files import atomic
 from ihbench.index import Index
 from ihbench.ledger import Ledger
 from ihbench.reopen import reopen_body, reopen_capture, reopen_protocol

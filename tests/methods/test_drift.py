@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from skimage.color import rgb2lab
 
-from ihbench import atomic
 from ihbench.body import texel_table
+from ihbench.files import atomic
 from ihbench.methods.inpainthuman.inpainting.drift import Drift, flicker, hidden_scores, identity_drift
 from ihbench.methods.inpainthuman.inpainting.patch_texture import STATISTICS, lab, patch_count, patch_texture
 from ihbench.metrics import psnr, ssim

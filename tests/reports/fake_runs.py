@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ihbench import atomic
+from ihbench.files import atomic
 from ihbench.metrics import Mean
 from ihbench.results import RunResult
 from ihbench.store import RunFolder, RunIdentity

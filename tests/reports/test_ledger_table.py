@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from ihbench.atomic import read_json
+from ihbench.files.atomic import read_json
 from ihbench.ledger import Ledger
 from ihbench.reports.ledger_table import TOLERANCE, account, ledger_section
 from ihbench.reports.markdown import markdown

@@ -17,8 +17,8 @@ import torch
 from torch import Tensor, nn
 
 from ihbench.errors import BadInput
+from ihbench.files.paths import user_path
 from ihbench.files.regular import read_text
-from ihbench.paths import user_path
 
 PICKLES = (".bin", ".ckpt", ".pt", ".pth", ".pkl")
 VARIANTS = ("", ".fp16", ".bf16")

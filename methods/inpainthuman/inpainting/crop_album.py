@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench import atomic, registry
+from ihbench import registry
 from ihbench.body import load_body
 from ihbench.errors import BadInput
+from ihbench.files import atomic
 from ihbench.files.npz import read_npz
 from ihbench.interruption import end_with_parent
 from ihbench.methods.inpainthuman.inpainting.part_map import part_labels

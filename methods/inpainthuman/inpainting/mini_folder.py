@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from ihbench.errors import BadInput
+from ihbench.files.paths import user_path
 from ihbench.methods.inpainthuman.inpainting.checkpoint import CONVERT, has_pickles, read_json, weight_files
 from ihbench.methods.inpainthuman.inpainting.text_encoder import TEXT_STEM
-from ihbench.paths import user_path
 
 SHIPPED = Path(__file__).parent / "mini"
 STEM = "diffusion_pytorch_model"

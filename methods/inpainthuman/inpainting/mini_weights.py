@@ -10,8 +10,8 @@ from typing import Any
 
 import torch
 
-from ihbench import atomic
 from ihbench.errors import BadInput
+from ihbench.files import atomic
 from ihbench.methods.inpainthuman.inpainting.backbone import Backbone
 from ihbench.methods.inpainthuman.inpainting.checkpoint import UnreadModule, empty_module
 from ihbench.methods.inpainthuman.inpainting.mini_folder import SHIPPED, STEMS, check_mini

@@ -42,9 +42,9 @@ def main(argv: list[str]) -> int:
 
 
 def _train(chosen: Any) -> dict[str, Any]:
-    from ihbench import removal
     from ihbench.data_source import cache_folder
-    from ihbench.locks import locked
+    from ihbench.files import removal
+    from ihbench.files.locks import locked
     from ihbench.methods.inpainthuman.inpainting.mini_card import write_card
     from ihbench.methods.inpainthuman.inpainting.mini_folder import SHIPPED, check_mini
     from ihbench.methods.inpainthuman.inpainting.mini_validation import validate

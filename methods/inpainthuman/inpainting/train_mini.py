@@ -16,8 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ihbench import atomic, registry
+from ihbench import registry
 from ihbench.errors import BadInput, Diverged
+from ihbench.files import atomic
 from ihbench.methods.inpainthuman.inpainting.backbone import Backbone, shrink_mask
 from ihbench.methods.inpainthuman.inpainting.crop_album import PAGE, CropAlbum
 from ihbench.methods.inpainthuman.inpainting.mini_batches import TRAIT_TOKENS, Batches, Crops, MiniBatch

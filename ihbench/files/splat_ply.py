@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench.atomic import write_bytes
 from ihbench.errors import visible
+from ihbench.files.atomic import write_bytes
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic: colour = 0.5 + SH_C0 * f_dc
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)  # quaternion, w first

@@ -9,7 +9,7 @@ from pathlib import PurePosixPath
 
 from ihbench import registry
 from ihbench.errors import BadInput
-from ihbench.paths import user_path
+from ihbench.files.paths import user_path
 
 WIDEST = 32  # digits that a number may be padded to
 PART = re.compile(r"\{\{|\}\}|\{(?P<name>[^{}:]*)(?P<format>:[^{}]*)?\}|[{}]")

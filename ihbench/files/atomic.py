@@ -23,10 +23,10 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from ihbench import removal
 from ihbench.errors import BadInput
+from ihbench.files import removal
+from ihbench.files.paths import cache_folder
 from ihbench.files.regular import read_bytes
-from ihbench.paths import cache_folder
 
 NON_FINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 MOST_LINKS = 40  # as the system follows
