@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from ihbench.kernel_cache import choose_kernel_cache
-from ihbench.threads import bound_spinning
+from ihbench.clock.kernel_cache import choose_kernel_cache
+from ihbench.clock.threads import bound_spinning
 from ihbench.version import __version__
 
 __all__ = ["__version__", "ablate", "load_scene", "run", "score"]

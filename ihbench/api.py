@@ -16,12 +16,12 @@ import numpy as np
 
 from ihbench import bounds, registry
 from ihbench.bounds import SEEDS
+from ihbench.clock.progress import Progress
 from ihbench.commands.device import check_device
 from ihbench.commands.keep import check_keep
 from ihbench.commands.scene_choice import OcclusionChoice, ProtocolChanges
 from ihbench.errors import BadInput
 from ihbench.files.paths import user_path
-from ihbench.progress import Progress
 from ihbench.protocol import Protocol, load_protocol
 from ihbench.results import RunResult
 
@@ -262,7 +262,7 @@ def _given(kind: type[Any], values: dict[str, Any], changes: dict[str, Any], occ
 
 def _progress(progress: Any) -> Progress:
     if progress is not None and not isinstance(progress, Progress):
-        raise BadInput(f"progress {bounds.shown(progress)}: expected an ihbench.progress.Progress, or None")
+        raise BadInput(f"progress {bounds.shown(progress)}: expected an ihbench.clock.progress.Progress, or None")
     return Progress() if progress is None else progress
 
 

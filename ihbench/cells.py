@@ -12,12 +12,12 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
+from ihbench.clock.failures import one_line
+from ihbench.clock.gpu_slots import only
+from ihbench.clock.interruption import GRACE, end_with_parent, interruptible, reason_of
+from ihbench.clock.progress import Progress
 from ihbench.data_source import DataSource
 from ihbench.errors import BadInput
-from ihbench.failures import one_line
-from ihbench.gpu_slots import only
-from ihbench.interruption import GRACE, end_with_parent, interruptible, reason_of
-from ihbench.progress import Progress
 from ihbench.results import RunResult, read_result
 from ihbench.run_loop import RunRequest, run_scene
 

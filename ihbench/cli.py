@@ -7,10 +7,11 @@ import sys
 from contextlib import suppress
 from importlib import import_module
 
-from ihbench import registry, streams
+from ihbench import registry
+from ihbench.clock import streams
+from ihbench.clock.failures import Failure, explained, one_line
+from ihbench.clock.interruption import interruptible
 from ihbench.errors import BadInput
-from ihbench.failures import Failure, explained, one_line
-from ihbench.interruption import interruptible
 from ihbench.provenance import description, note_command
 from ihbench.version import __version__
 

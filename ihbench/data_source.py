@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 from ihbench import registry
 from ihbench.body import Body, load_body
 from ihbench.bounds import LARGEST_CAST, refuse_repeated
+from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.files.paths import cache_folder, path_from, user_path
-from ihbench.progress import Progress
 from ihbench.protocol import Protocol
 from ihbench.scene import Capture, Dataset
 

@@ -25,9 +25,9 @@ from ihbench import registry
 from ihbench.body import Body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
+from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.files import atomic, locks, removal
-from ihbench.progress import Progress
 from ihbench.scene import MaskState, TrainView
 from ihbench.version import __version__
 from ihbench.views import OccludedScene

@@ -10,13 +10,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from ihbench import machine
+from ihbench.clock import machine
+from ihbench.clock.failures import one_line
+from ihbench.clock.interruption import asked, interruptible, reason_of, undisturbed
+from ihbench.clock.ledger import Ledger, OnCheckpoint
+from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput, Diverged
-from ihbench.failures import one_line
 from ihbench.files import atomic, removal
-from ihbench.interruption import asked, interruptible, reason_of, undisturbed
-from ihbench.ledger import Ledger, OnCheckpoint
-from ihbench.progress import Progress
 from ihbench.protocol import Protocol
 from ihbench.results import TRACEBACK, RunResult, read_result
 from ihbench.scene import Capture

@@ -11,11 +11,11 @@ from pathlib import Path
 
 from numpy.typing import NDArray
 
+from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.images import read_image
 from ihbench.metrics.evaluate import Preset, find_preset
-from ihbench.progress import Progress
 from ihbench.record import preset_lines
 from ihbench.reopen import reopen_protocol, reopen_scene
 from ihbench.results import view_rows

@@ -18,16 +18,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench import bounds, machine, registry
+from ihbench import bounds, registry
 from ihbench.bounds import SEEDS
 from ihbench.capture_digest import capture_digest
+from ihbench.clock import machine
+from ihbench.clock.progress import Progress
 from ihbench.config_fields import flat, with_fields
 from ihbench.curve_views import curve_views
 from ihbench.data_source import DataSource
 from ihbench.errors import BadInput
 from ihbench.metrics import mean_over_frames
 from ihbench.plan import Omission, SceneMeasure, absent_regions, measure_scene
-from ihbench.progress import Progress
 from ihbench.protocol import Protocol
 from ihbench.provenance import command
 from ihbench.recorded_run import RecordedRun, about_scene, recorded

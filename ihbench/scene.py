@@ -16,8 +16,8 @@ from ihbench.camera import Camera
 
 if TYPE_CHECKING:
     from ihbench.body import Body
-    from ihbench.ledger import Ledger
-    from ihbench.progress import Progress
+    from ihbench.clock.ledger import Ledger
+    from ihbench.clock.progress import Progress
 
 
 class MaskState(IntEnum):

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ihbench.capture_digest import capture_digest
+from ihbench.clock.progress import Progress
 from ihbench.data_source import DataSource
 from ihbench.prediction_doubts import Doubts
 from ihbench.predictions import Predictions, find_alpha, find_predictions
 from ihbench.prepared import Prepared
-from ihbench.progress import Progress
 from ihbench.protocol import Protocol
 from ihbench.provenance import command
 from ihbench.recorded_run import RecordedRun, about_scene, recorded

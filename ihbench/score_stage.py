@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.calibration import ROWS, Calibration
+from ihbench.clock.progress import Progress
 from ihbench.contact_sheet import SheetRow, contact_sheet
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.images import write_png
 from ihbench.metrics.eight_bit import rounded
-from ihbench.progress import Progress
 from ihbench.record import score_lines
 from ihbench.results import group_row, view_rows
 from ihbench.scoring import LoadedView, Predictor, Scorer

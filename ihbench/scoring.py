@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ihbench.clock.machine import usable_cores
+from ihbench.clock.threads import single_threaded_libraries
 from ihbench.errors import BadInput
-from ihbench.machine import usable_cores
 from ihbench.metrics.eight_bit import rounded
 from ihbench.metrics.evaluate import Preset, evaluate, find_preset
 from ihbench.metrics.identity import Score
@@ -21,7 +22,6 @@ from ihbench.metrics.images import as_image, check_range
 from ihbench.occlusion import withheld
 from ihbench.regions import SurfaceMap
 from ihbench.scene import TestView
-from ihbench.threads import single_threaded_libraries
 from ihbench.views import OccludedScene, TestViewKey
 from ihbench.visibility import Visibility, texel_visibility
 

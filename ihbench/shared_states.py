@@ -51,7 +51,7 @@ def lend(other: RunFolder, borrower: RunFolder, state: str) -> list[dict[str, An
 
 def _last_step(file: Path) -> int | None:
     """The step that a saved state was taken at; None for a damaged file, which nobody should borrow."""
-    from ihbench.ledger import saved_meta
+    from ihbench.clock.ledger import saved_meta
 
     try:
         return int(saved_meta(file)["step"])

@@ -33,11 +33,11 @@ BENCH = Path(__file__).resolve().parent
 # of the bench: commands, what only shows or checks numbers, and the rooms, which are asked for one by one
 NOT_IN_NUMBERS = (
     *(f"{room}/*" for room in registry.ROOMS),
-    "commands/*", "kernels/*", "stress/*", "__main__.py", "cli.py", "progress.py", "errors.py", "registry.py",
+    "commands/*", "kernels/*", "stress/*", "__main__.py", "cli.py", "clock/progress.py", "errors.py", "registry.py",
     "ablation.py", "cells.py", "earlier_runs.py", "index.py", "quality_time.py",
     "contact_sheet.py", "diagram.py", "files/splat_ply.py", "row_choice.py", "row_labels.py",
-    "api.py", "repeat.py", "gpu_slots.py", "failures.py", "streams.py",
-    "machine.py", "provenance.py", "threads.py",
+    "api.py", "repeat.py", "clock/gpu_slots.py", "clock/failures.py", "clock/streams.py",
+    "clock/machine.py", "provenance.py", "clock/threads.py",
     "metrics/check.py", "metrics/cases.py", "metrics/*oracle.py", "metrics/reference_values.py",
 )  # fmt: skip
 DESCRIPTIONS = ("*.md", "*.rst", "*.typed", "*~", ".*", "card.toml")

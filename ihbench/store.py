@@ -24,11 +24,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, get_args
 
-from ihbench import machine
+from ihbench.clock import machine
+from ihbench.clock.interruption import undisturbed
+from ihbench.clock.ledger import Ledger, is_saved_state
 from ihbench.errors import BadInput
 from ihbench.files import atomic, locks, removal
-from ihbench.interruption import undisturbed
-from ihbench.ledger import Ledger, is_saved_state
 from ihbench.provenance import provenance
 from ihbench.record import Status, curve_points, read_json, record_fault, score_lines
 

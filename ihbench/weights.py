@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ihbench import registry
+from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.paths import path_from, users_cache
-from ihbench.progress import Progress
 
 CHUNK = 2**20  # bytes
 PATIENCE = 30  # s without a byte

@@ -6,7 +6,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ihbench.machine import BUSY
+from ihbench.clock.machine import BUSY
 from ihbench.reports.document import Words
 from ihbench.results import RunResult
 from ihbench.row_labels import by_label

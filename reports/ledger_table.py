@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 
-from ihbench.ledger import in_order
+from ihbench.clock.ledger import in_order
 from ihbench.reports.clock import by_machine
 from ihbench.reports.document import Block, Heading, Paragraph, Table, Words, bullets, emphasis, strong
 from ihbench.results import RunResult

@@ -8,13 +8,13 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ihbench.body import Body, load_body
+from ihbench.clock.progress import Progress
 from ihbench.datasets.standin.subject import Subject
 from ihbench.datasets.standin_mark import STANDIN_FILE
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.locks import locked
 from ihbench.files.paths import user_path
-from ihbench.progress import Progress
 
 NAME_PREFIX = "standin-"
 ADVICE = "choose another folder (--out, IHBENCH_CACHE)"

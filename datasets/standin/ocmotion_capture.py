@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from ihbench.camera import Camera, look_at
+from ihbench.clock.progress import Progress
 from ihbench.datasets import ocmotion_w2a
 from ihbench.datasets.standin import motion
 from ihbench.datasets.standin.cast import alone_with, cast_names, open_cast
@@ -24,7 +25,6 @@ from ihbench.datasets.standin.studio import empty_studio
 from ihbench.datasets.standin.subject import Subject
 from ihbench.files import atomic
 from ihbench.files.pictures import encoded
-from ihbench.progress import Progress
 
 VERSION = 1  # of the generator; a change that moves a pixel raises it
 N_FRAMES = 100

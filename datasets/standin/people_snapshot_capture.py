@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ihbench.body.pose import BodyPose
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera, look_at
+from ihbench.clock.progress import Progress
 from ihbench.datasets import people_snapshot
 from ihbench.datasets.standin import motion
 from ihbench.datasets.standin.cast import alone_with, cast_names, open_cast
@@ -25,7 +26,6 @@ from ihbench.datasets.standin.studio import empty_studio
 from ihbench.datasets.standin.subject import Subject
 from ihbench.files import atomic
 from ihbench.files.pictures import encoded
-from ihbench.progress import Progress
 
 VERSION = 1  # of the generator; a change that moves a pixel raises it
 TURN_FRAMES, TEST_FRAMES = 160, 80

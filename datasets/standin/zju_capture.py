@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ihbench.clock.progress import Progress
 from ihbench.datasets import zju_mocap
 from ihbench.datasets.standin.cast import alone_with, cast_names, open_cast
 from ihbench.datasets.standin.motion import N_FRAMES, NOVEL_FRAMES
@@ -19,7 +20,6 @@ from ihbench.datasets.standin.rig import N_CAMERAS
 from ihbench.datasets.standin.studio import empty_studio
 from ihbench.datasets.standin.subject import Subject
 from ihbench.errors import BadInput
-from ihbench.progress import Progress
 
 VERSION = 2  # of the generator; a change that moves a pixel raises it
 ALL_FRAMES = N_FRAMES + NOVEL_FRAMES

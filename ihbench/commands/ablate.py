@@ -12,18 +12,18 @@ import tyro
 
 from ihbench import registry
 from ihbench.bounds import SEEDS, Within, refuse_repeated
+from ihbench.clock.gpu_slots import card_slots, free_memory
 from ihbench.commands.device import check_device
 from ihbench.commands.keep import check_keep
 from ihbench.commands.parse import options
 from ihbench.commands.scene_choice import SceneChoice
 from ihbench.errors import BadInput
-from ihbench.gpu_slots import card_slots, free_memory
 
 if TYPE_CHECKING:
     from ihbench.ablation import Ladder
     from ihbench.cells import Cell, CellOutcome
+    from ihbench.clock.progress import Progress
     from ihbench.data_source import DataSource
-    from ihbench.progress import Progress
 
 BETWEEN = ":"  # values of one switch
 
@@ -58,7 +58,7 @@ def main(argv: list[str]) -> int:
 
 
 def _ablate(chosen: AblateOptions) -> int:
-    from ihbench.progress import Progress
+    from ihbench.clock.progress import Progress
 
     if chosen.ladder == "list":
         for name, found in _ladders(chosen.method).items():
@@ -83,7 +83,7 @@ def ablated(
     numbers, and how each run ended. The options' own words for both are not read. Raises `BadInput`."""
     from ihbench import outputs
     from ihbench.cells import run_cells
-    from ihbench.machine import usable_cores
+    from ihbench.clock.machine import usable_cores
 
     if not chosen.seed:
         raise BadInput("--seed: expected one number or more")

@@ -107,8 +107,8 @@ def _lines(value: Any, indent: str = "") -> Iterator[str]:
 
 
 def _standin(chosen: Standin) -> int:
+    from ihbench.clock.progress import Progress
     from ihbench.data_source import wanted_frames
-    from ihbench.progress import Progress
     from ihbench.protocol import load_protocol
 
     standin = registry.load("stand-in", chosen.dataset)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from ihbench import streams
+from ihbench.clock import streams
 from ihbench.commands.parse import options
 
 if TYPE_CHECKING:

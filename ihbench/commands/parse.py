@@ -10,7 +10,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from ihbench import bounds, streams
+from ihbench import bounds
+from ihbench.clock import streams
 from ihbench.errors import BadInput
 from ihbench.files.paths import user_path
 

@@ -31,9 +31,9 @@ def main(argv: list[str]) -> int:
 
 
 def _planned(chosen: SceneChoice, protocol: Protocol) -> dict[str, Any]:
+    from ihbench.clock.machine import cpu_model
     from ihbench.data_source import locate, open_capture
     from ihbench.earlier_runs import earlier_runs
-    from ihbench.machine import cpu_model
     from ihbench.plan import absent_regions, measure_scene
     from ihbench.run_loop import configuration
     from ihbench.source_digest import code_of

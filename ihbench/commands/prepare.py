@@ -44,9 +44,9 @@ class PrepareOptions(ProtocolChanges):
 def main(argv: list[str]) -> int:
     chosen = options(PrepareOptions, argv, "prepare", "Write the occluded training set, and nothing that it hides.")
     from ihbench import registry
+    from ihbench.clock.progress import Progress
     from ihbench.data_source import locate, own_body
     from ihbench.prepare import check_target, prepare
-    from ihbench.progress import Progress
     from ihbench.protocol import load_protocol
     from ihbench.views import open_scene
 

@@ -117,7 +117,7 @@ def main(argv: list[str]) -> int:
 
 def _with_presets(result: RunResult, chosen: ReportOptions) -> RunResult:
     """The run with the numbers of the presets asked for; one whose data are not to be had is named and left out."""
-    from ihbench.progress import Progress
+    from ihbench.clock.progress import Progress
     from ihbench.rescore import rescore
     from ihbench.results import read_result
 

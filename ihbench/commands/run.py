@@ -95,8 +95,8 @@ def _run(chosen: Any) -> int:
     registry.entry_point("report", "md")  # before anything is fitted: another package may claim the name
     from dataclasses import replace
 
+    from ihbench.clock.progress import Progress
     from ihbench.data_source import locate
-    from ihbench.progress import Progress
     from ihbench.protocol import load_protocol
     from ihbench.run_loop import RunRequest, run_scene
 
@@ -123,8 +123,8 @@ def _run(chosen: Any) -> int:
 def _repeat(chosen: LikeOptions) -> int:
     check_device(chosen.device)
     registry.entry_point("report", "md")
+    from ihbench.clock.progress import Progress
     from ihbench.data_source import locate
-    from ihbench.progress import Progress
     from ihbench.repeat import differences, repetition
     from ihbench.run_loop import run_scene
 

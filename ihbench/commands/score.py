@@ -16,9 +16,9 @@ from ihbench.errors import BadInput
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from ihbench.clock.progress import Progress
     from ihbench.data_source import DataSource
     from ihbench.prepared import Prepared
-    from ihbench.progress import Progress
     from ihbench.results import RunResult
 
 
@@ -60,7 +60,7 @@ class ScoreOptions(ProtocolChanges):
 
 def main(argv: list[str]) -> int:
     chosen = options(ScoreOptions, argv, "score", "Score images that somebody else's code rendered.")
-    from ihbench.progress import Progress
+    from ihbench.clock.progress import Progress
     from ihbench.results import as_json
 
     if chosen.names:

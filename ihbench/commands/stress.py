@@ -26,7 +26,7 @@ def main(argv: list[str]) -> int:
         StressOptions, argv, "stress",
         "Stiff and extreme cases with known answers; status 1 if one fails that is not listed as known.",
     )  # fmt: skip
-    from ihbench.progress import Progress
+    from ihbench.clock.progress import Progress
     from ihbench.stress.run import chosen_cases, run_cases
     from ihbench.stress.table import as_json, failures, print_table
 

@@ -64,7 +64,7 @@ def main(argv: list[str]) -> int:
 
 
 def _fetch(chosen: Fetch) -> int:
-    from ihbench.progress import Progress
+    from ihbench.clock.progress import Progress
 
     for entry in [weights.find_weights(name) for name in chosen.name]:
         print(f"{entry.name}: {weights.fetch(entry, Progress())}")

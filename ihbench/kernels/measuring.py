@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ihbench import machine
+from ihbench.clock import machine
 
 Row = dict[str, Any]
 UNSTABLE = 0.25  # a spread above this share of the median is marked

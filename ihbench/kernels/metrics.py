@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ihbench.clock.threads import one_torch_thread, single_threaded_libraries
 from ihbench.errors import BadInput
 from ihbench.kernels.measuring import Row, interleave, peak_mib, summary
 from ihbench.metrics.cases import Case, hashed, person_case
-from ihbench.threads import one_torch_thread, single_threaded_libraries
 
 if TYPE_CHECKING:
     from ihbench.metrics.evaluate import Preset

@@ -26,10 +26,10 @@ def score_rows(repeats: int, views: int = VIEWS, profile: str = PROFILE) -> list
 
     The predictions are the truth a pixel off. `repeats` above 3 are 3.
     """
+    from ihbench.clock.progress import Progress
     from ihbench.data_source import locate
     from ihbench.files.images import read_image, write_png
     from ihbench.metrics.eight_bit import rounded
-    from ihbench.progress import Progress
     from ihbench.protocol import load_protocol
     from ihbench.scoring import Scorer
     from ihbench.views import open_scene

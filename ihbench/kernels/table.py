@@ -11,7 +11,8 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from ihbench import machine, registry, streams
+from ihbench import registry
+from ihbench.clock import machine, streams
 from ihbench.errors import BadInput
 from ihbench.kernels.measuring import UNSTABLE, Row
 from ihbench.kernels.metrics import flip_rows, frame_rows, lpips_rows, ssim_rows

@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from ihbench.body import texel_table
 from ihbench.calibration import Calibration
 from ihbench.camera import Camera
+from ihbench.clock.ledger import Ledger
 from ihbench.data_check import fitness
 from ihbench.errors import BadInput
 from ihbench.files.atomic import read_json, write_json
 from ihbench.files.images import read_image
 from ihbench.files.safe_pickle import load_npy, load_pickle
-from ihbench.ledger import Ledger
 from ihbench.occlusion import apply_rule
 from ihbench.plan import measure_scene
 from ihbench.protocol import Protocol, Span

@@ -9,9 +9,9 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 
 from ihbench import registry
+from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput
 from ihbench.stress.case import Case, Outcome, Verdict, error_of
-from ihbench.threads import one_torch_thread
 
 GROUPS = ("metrics", "geometry", "splat", "data", "training", "ranking")  # a module each, with a list CASES
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from itertools import groupby
 from typing import Any
 
-from ihbench import streams
+from ihbench.clock import streams
 from ihbench.stress.case import Outcome
 
 TABLE_WIDTH = 150  # characters; a narrower terminal would cut the numbers
@@ -18,7 +18,7 @@ UNITS = {"ulp": "ulp", "relative": "rel", "absolute": "abs", "at most": "over", 
 
 def as_json(outcomes: Sequence[Outcome], seconds: float, processor_seconds: float) -> str:
     """One strict JSON object {"ok", "seconds", …, "machine", "cases": […]}; NaN and infinities as in `atomic`."""
-    from ihbench import machine
+    from ihbench.clock import machine
     from ihbench.files.atomic import encode
 
     found = {

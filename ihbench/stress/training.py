@@ -10,8 +10,8 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from ihbench.clock.ledger import Ledger
 from ihbench.errors import Diverged
-from ihbench.ledger import Ledger
 from ihbench.stress.case import Answer, Case
 
 

@@ -15,8 +15,9 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from ihbench.clock.ledger import Ledger
+from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
-from ihbench.ledger import Ledger
 from ihbench.methods.inpainthuman.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.inpainting.painted_view import PaintedView
 from ihbench.methods.inpainthuman.stage1 import Stage1
@@ -24,7 +25,6 @@ from ihbench.methods.inpainthuman.stage2 import STATE as PAINTED_STATE
 from ihbench.methods.inpainthuman.stage2 import Stage2
 from ihbench.methods.inpainthuman.stage3 import Stage3
 from ihbench.metrics import mean_over_frames
-from ihbench.progress import Progress
 from ihbench.reopen import reopen_scene
 from ihbench.results import read_result
 from ihbench.scene import MaskState, TrainingSet, TrainView

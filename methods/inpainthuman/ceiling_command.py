@@ -48,8 +48,8 @@ def main(argv: list[str]) -> int:
 
 def _ceiling(chosen: CeilingOptions) -> int:
     from ihbench import outputs
+    from ihbench.clock.progress import Progress
     from ihbench.methods.inpainthuman.ceiling import ceiling
-    from ihbench.progress import Progress
     from ihbench.results import read_result
 
     if not chosen.run:

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from ihbench.body import Body
+from ihbench.clock.ledger import Ledger
+from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
-from ihbench.ledger import Ledger
 from ihbench.methods.inpainthuman.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.config import InpaintHumanConfig
 from ihbench.methods.inpainthuman.stage1 import Stage1
-from ihbench.progress import Progress
 from ihbench.scene import TrainingSet
 
 

@@ -20,10 +20,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ihbench.clock.ledger import Ledger
+from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput, Diverged
-from ihbench.ledger import Ledger
 from ihbench.methods.inpainthuman.avatar import GaussianAvatar
-from ihbench.progress import Progress
 from ihbench.scene import MaskState, TrainingSet
 
 GOOD_EVERY = 25  # steps between two copies to go back to

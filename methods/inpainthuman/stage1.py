@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ihbench.camera import Camera
-from ihbench.ledger import Ledger
+from ihbench.clock.ledger import Ledger
 from ihbench.methods.inpainthuman.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.config import ONE_FIT_SSIM
 from ihbench.methods.inpainthuman.dissimilarity import dissimilarity, where_known

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench.ledger import Ledger
+from ihbench.clock.ledger import Ledger
+from ihbench.clock.progress import Progress
 from ihbench.methods.inpainthuman.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.inpainting.crop_view import CropView, Inpainter, cut_view, with_frames
 from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
 from ihbench.methods.inpainthuman.inpainting.painted_view import PaintedView, paste_back
 from ihbench.methods.inpainthuman.inpainting.shown_view import turntable_view, with_known_surface
 from ihbench.methods.inpainthuman.inpainting.surface_need import SeenSurface, key_views, seen_surface
-from ihbench.progress import Progress
 from ihbench.scene import MaskState, TrainingSet, TrainView
 
 STATE = "stage2-painted"

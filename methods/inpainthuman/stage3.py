@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
+from ihbench.clock.ledger import Ledger
+from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
-from ihbench.ledger import Ledger
 from ihbench.methods.inpainthuman.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.inpainting.painted_view import PaintedView
 from ihbench.methods.inpainthuman.optimisation import Optimisation
@@ -29,7 +30,6 @@ from ihbench.methods.inpainthuman.stage1 import (
     initial_loss,
     prepare_target,
 )
-from ihbench.progress import Progress
 from ihbench.scene import MaskState, TrainingSet, TrainView
 from ihbench.views import LazyViews
 

@@ -15,16 +15,16 @@ from ihbench import cells as cells_module
 from ihbench import registry
 from ihbench.ablation import Comparison, Ladder, Rung, configured, grid, kept, set_on_all, shared_part
 from ihbench.cells import Cell, run_cells
+from ihbench.clock.ledger import Ledger
+from ihbench.clock.progress import Progress
 from ihbench.commands import ablate as ablate_command
 from ihbench.commands.ablate import AblateOptions
 from ihbench.config_fields import flat
 from ihbench.data_source import DataSource
 from ihbench.errors import BadInput
 from ihbench.files.atomic import read_json
-from ihbench.ledger import Ledger
 from ihbench.methods.inpainthuman.config import LEAST_TEXELS, PROFILES, QUICK
 from ihbench.plan import SceneMeasure
-from ihbench.progress import Progress
 from ihbench.protocol import load_protocol
 from ihbench.results import read_result
 from ihbench.run_loop import RunRequest, _planned

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import ihbench
+from ihbench.clock.progress import Progress
 from ihbench.data_source import locate
 from ihbench.errors import BadInput
 from ihbench.files.atomic import read_json
-from ihbench.progress import Progress
 from ihbench.protocol import load_protocol
 from ihbench.run_loop import RunRequest
 

@@ -12,9 +12,9 @@ import pytest
 from PIL import Image
 
 from ihbench import data_source
+from ihbench.clock.ledger import Ledger
 from ihbench.files import locks
 from ihbench.files.atomic import read_json
-from ihbench.ledger import Ledger
 from ihbench.results import read_result
 from ihbench.store import RunFolder
 from tests.conftest import contents, tiny_protocol

@@ -7,11 +7,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from ihbench import gpu_slots
 from ihbench.cells import Cell, run_cells
+from ihbench.clock import gpu_slots
+from ihbench.clock.gpu_slots import RUN_MEMORY, card_slots, free_memory, only
+from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
-from ihbench.gpu_slots import RUN_MEMORY, card_slots, free_memory, only
-from ihbench.progress import Progress
 
 GIB = 2**30
 

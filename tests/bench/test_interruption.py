@@ -13,12 +13,12 @@ from pathlib import Path
 
 import pytest
 
-from ihbench import interruption
+from ihbench.clock import interruption
+from ihbench.clock.interruption import Terminated, interruptible, undisturbed
+from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.files.atomic import read_json
 from ihbench.index import Index
-from ihbench.interruption import Terminated, interruptible, undisturbed
-from ihbench.progress import Progress
 from ihbench.recorded_run import RecordedRun, recorded
 from ihbench.results import read_result
 from ihbench.store import KILLED, RunFolder
@@ -37,7 +37,7 @@ class Waits(recorded_run.RecordedRun):
         time.sleep(600)
 
 def command(argv):
-    from ihbench.progress import Progress
+    from ihbench.clock.progress import Progress
     make = lambda folder: Waits(folder, Progress.silent())
     recorded_run.recorded(Path(sys.argv[1]), IDENTITY, {"standin": "", "variant": ""}, False, make)
 
@@ -51,7 +51,7 @@ import sys
 from pathlib import Path
 from ihbench import cells
 from ihbench.cells import Cell, run_cells
-from ihbench.progress import Progress
+from ihbench.clock.progress import Progress
 
 def child(connection, request, source, scene, threads):
     from tests.bench.test_interruption import hold
@@ -280,7 +280,7 @@ def test_a_record_once_begun_is_written():
 
 def test_a_forked_process_ends_by_the_signal_itself():
     code = (
-        "import os, signal; from ihbench.interruption import interruptible\n"
+        "import os, signal; from ihbench.clock.interruption import interruptible\n"
         "with interruptible():\n"
         "    child = os.fork()\n"
         "    if child == 0: signal.raise_signal(signal.SIGTERM); os._exit(7)\n"

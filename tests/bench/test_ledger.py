@@ -12,7 +12,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ihbench.ledger import Ledger, QualityTimes
+from ihbench.clock.ledger import Ledger, QualityTimes
 
 
 class Clock:
@@ -276,7 +276,7 @@ def test_a_state_comes_back_as_it_was(tmp_path, on_disk):
 
 def test_a_state_of_arrays_needs_no_torch(tmp_path):
     code = (
-        "import sys, numpy as np; from pathlib import Path; from ihbench.ledger import Ledger\n"
+        "import sys, numpy as np; from pathlib import Path; from ihbench.clock.ledger import Ledger\n"
         f"l = Ledger(Path({str(tmp_path)!r})); l.save_state('a', {{'x': np.arange(3.0)}}, {{}})\n"
         "assert (l.load_state('a')[0]['x'] == [0, 1, 2]).all(); assert 'torch' not in sys.modules"
     )
@@ -301,7 +301,7 @@ def test_saving_is_booked_apart_and_throttled():
 def test_slow_saves_are_made_rarer(monkeypatch):
     clock = Clock()
     ledger = Ledger(clock=clock, save_every=20)
-    monkeypatch.setattr("ihbench.ledger._copies", lambda tensors: clock.sleep(10) or {})
+    monkeypatch.setattr("ihbench.clock.ledger._copies", lambda tensors: clock.sleep(10) or {})
     ledger.save_state("s", {}, {})
     clock.sleep(199)
     assert not ledger.due_to_save()

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ihbench import machine, provenance
+from ihbench import provenance
+from ihbench.clock import machine
 from ihbench.files import atomic
 
 

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.prepare import prepare
-from ihbench.progress import Progress
 from ihbench.scene import MaskState
 from ihbench.views import open_scene
 from tests.bench.fake_capture import fake_protocol, the_body, turning_capture

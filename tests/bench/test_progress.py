@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from ihbench.progress import Progress, duration
+from ihbench.clock.progress import Progress, duration
 
 
 class Terminal(io.StringIO):

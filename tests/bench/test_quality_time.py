@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ihbench.clock.ledger import Ledger
 from ihbench.errors import BadInput
-from ihbench.ledger import Ledger
 from ihbench.quality_time import (
     NEVER,
     QualityCurve,

@@ -7,10 +7,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from ihbench import machine
+from ihbench.clock import machine
+from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.files import atomic
-from ihbench.progress import Progress
 from ihbench.recorded_run import RecordedRun, recorded
 from ihbench.store import RunFolder
 from tests.bench.test_store import IDENTITY

@@ -13,11 +13,11 @@ import pytest
 
 from ihbench import store
 from ihbench.cli import main
+from ihbench.clock.ledger import Ledger
+from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.files import locks, removal
-from ihbench.ledger import Ledger
 from ihbench.prepare import prepare
-from ihbench.progress import Progress
 from ihbench.store import RunFolder
 from ihbench.views import open_scene
 from tests.bench.fake_capture import fake_protocol, the_body, turning_capture

@@ -8,8 +8,8 @@ from textwrap import dedent
 import pytest
 
 from ihbench import bounds, registry
+from ihbench.clock.ledger import Ledger
 from ihbench.files.atomic import read_json, read_json_lines
-from ihbench.ledger import Ledger
 from tests.conftest import contents
 
 SAVED, STOPPED, LAST = 3, 6, 8  # the step whose state is saved, the step that is never finished, the last step
@@ -35,7 +35,7 @@ def run_until_killed(bench, patch):
 import os, signal, sys
 from ihbench import run_loop
 from ihbench.cli import main
-from ihbench.ledger import Ledger
+from ihbench.clock.ledger import Ledger
 
 die = lambda: os.kill(os.getpid(), signal.SIGKILL)
 {dedent(patch)}

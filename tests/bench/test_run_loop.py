@@ -10,12 +10,12 @@ from PIL import Image
 import ihbench
 from ihbench import registry
 from ihbench.calibration import ROWS, Calibration
+from ihbench.clock.progress import Progress
 from ihbench.data_source import locate
 from ihbench.files import atomic
 from ihbench.files.atomic import read_json, read_json_lines
 from ihbench.methods.inpainthuman.config import QUICK
 from ihbench.metrics import psnr
-from ihbench.progress import Progress
 from ihbench.protocol import load_protocol
 from ihbench.results import read_result
 from ihbench.scene import MaskState

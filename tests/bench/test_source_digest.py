@@ -14,9 +14,9 @@ import pytest
 
 from ihbench import registry, source_digest
 from ihbench.calibration import Calibration
+from ihbench.clock.ledger import Ledger
 from ihbench.errors import BadInput
 from ihbench.files import atomic
-from ihbench.ledger import Ledger
 from ihbench.protocol import load_protocol
 from ihbench.shared_states import lender
 from ihbench.source_digest import bench_code, code_of, tree_digest
@@ -47,7 +47,13 @@ OF_THE_BENCH = [
     *("ihbench/views.py", "ihbench/occlusion.py", "ihbench/regions.py", "ihbench/visibility.py"),
     *("ihbench/metrics/ssim.py", "ihbench/metrics/flip_numba.py", "ihbench/metrics/presets.py"),
     *("ihbench/scoring.py", "ihbench/score_stage.py", "ihbench/calibration.py", "ihbench/predictions.py"),
-    *("ihbench/plan.py", "ihbench/protocol.py", "ihbench/camera.py", "ihbench/run_loop.py", "ihbench/ledger.py"),
+    *(
+        "ihbench/plan.py",
+        "ihbench/protocol.py",
+        "ihbench/camera.py",
+        "ihbench/run_loop.py",
+        "ihbench/clock/ledger.py",
+    ),
     *("protocols/occlusion.py", "datasets/zju_mocap.py", "datasets/capture_folder.py"),
 ]
 OF_THE_METHOD = ["methods/inpainthuman/stage1.py", "methods/inpainthuman/inpainting/sampling.py"]

@@ -16,9 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ihbench import store
+from ihbench.clock.ledger import Ledger
 from ihbench.errors import BadInput
 from ihbench.files import locks
-from ihbench.ledger import Ledger
 from ihbench.store import RunFolder, RunIdentity
 
 IDENTITY = RunIdentity(

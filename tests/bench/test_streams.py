@@ -7,8 +7,9 @@ import sys
 
 import pytest
 
-from ihbench import registry, streams
+from ihbench import registry
 from ihbench.cli import main
+from ihbench.clock import streams
 
 NASTY = "a\x1b[2J\x1b[31mb\x9b\u202ec\U000e0041"
 

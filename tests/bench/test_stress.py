@@ -13,8 +13,8 @@ import pytest
 
 from ihbench import registry
 from ihbench.cli import main
+from ihbench.clock.ledger import Ledger
 from ihbench.errors import BadInput, Diverged
-from ihbench.ledger import Ledger
 from ihbench.metrics import ssim as ssim_function
 from ihbench.stress import run
 from ihbench.stress.case import Answer, Case, error_of, words_of

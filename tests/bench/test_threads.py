@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from ihbench.threads import WAITING, WORDS
+from ihbench.clock.threads import WAITING, WORDS
 
 # says what OpenMP is going to read, at the moment at which torch is first looked for
 WATCH = f"""

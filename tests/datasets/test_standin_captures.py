@@ -293,7 +293,7 @@ import sys, time
 from pathlib import Path
 from ihbench.datasets.standin import {module}
 from ihbench.errors import BadInput
-from ihbench.progress import Progress
+from ihbench.clock.progress import Progress
 root, seed, gate = Path(sys.argv[1]), int(sys.argv[2]), Path(sys.argv[3])
 (gate / str(time.monotonic_ns())).touch()
 while len(list(gate.iterdir())) < int(sys.argv[4]):

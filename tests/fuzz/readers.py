@@ -21,6 +21,7 @@ from ihbench.body import load_body
 from ihbench.body.pose import BodyPose
 from ihbench.body.smpl_file import read_arrays, write_body
 from ihbench.body.uv_obj import read_uv_obj
+from ihbench.clock.ledger import Ledger
 from ihbench.datasets import gaussianavatar, instantavatar, ocmotion_w2a, people_snapshot, plain_scene
 from ihbench.datasets import zju_mocap as zju
 from ihbench.datasets.pickles import write_pickle
@@ -29,7 +30,6 @@ from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.images import read_image
 from ihbench.files.safe_pickle import load_npy, load_pickle
-from ihbench.ledger import Ledger
 from ihbench.protocol import read_protocol
 from ihbench.reports.paper_numbers import paper_table
 from ihbench.reports.table_reading import read_tables

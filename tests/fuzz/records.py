@@ -16,11 +16,11 @@ from typing import Any
 from ihbench.ablation import Comparison, Ladder, Rung
 from ihbench.cells import Cell, CellOutcome
 from ihbench.cli import main
+from ihbench.clock.ledger import Ledger
 from ihbench.earlier_runs import earlier_runs
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.index import Index
-from ihbench.ledger import Ledger
 from ihbench.reopen import reopen_body, reopen_capture, reopen_protocol
 from ihbench.reports import ablation
 from ihbench.results import read_result

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput
 from ihbench.methods.inpainthuman.inpainting import complete_silhouette as module
 from ihbench.methods.inpainthuman.inpainting.complete_silhouette import (
@@ -19,7 +20,6 @@ from ihbench.methods.inpainthuman.inpainting.complete_silhouette import (
 )
 from ihbench.methods.inpainthuman.inpainting.crop_view import CropView, cut_view
 from ihbench.methods.inpainthuman.inpainting.part_map import NO_PART
-from ihbench.threads import one_torch_thread
 from tests.bench.fake_capture import WHITE, a_camera, a_pose, the_body, train_view
 
 FINDERS = [CoverageSilhouette(WHITE), GrabCutSilhouette(WHITE)]

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from ihbench.body import texel_table
+from ihbench.clock.progress import Progress
+from ihbench.clock.threads import one_torch_thread
 from ihbench.methods.inpainthuman.inpainting.colour_fills import GREY, MeanColour, NavierStokes, Telea
 from ihbench.methods.inpainthuman.inpainting.fillers import fillers
 from ihbench.methods.inpainthuman.inpainting.inpaint_config import Filler
@@ -19,8 +21,6 @@ from ihbench.methods.inpainthuman.inpainting.texture_fills import (
     nearest_colours,
 )
 from ihbench.metrics import psnr
-from ihbench.progress import Progress
-from ihbench.threads import one_torch_thread
 from tests.bench.fake_capture import the_body
 
 from .hidden_person import (

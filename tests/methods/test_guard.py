@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 
+from ihbench.clock.ledger import Ledger
+from ihbench.clock.progress import Progress
+from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import Diverged
-from ihbench.ledger import Ledger
 from ihbench.methods.inpainthuman.optimisation import GOOD_EVERY, MOST_ROLL_BACKS, SMALLER
 from ihbench.methods.inpainthuman.stage1 import Stage1, loss_of, prepare_target
-from ihbench.progress import Progress
 from ihbench.scene import MaskState
-from ihbench.threads import one_torch_thread
 
 from .tiny_fit import an_avatar, equal_bits, fitted, parameters_of, training_set, training_views
 

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from ihbench.body import CANONICAL_POSES, canonical_pose
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
+from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput
 from ihbench.methods.inpainthuman.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.config import QUICK
@@ -19,7 +20,6 @@ from ihbench.methods.inpainthuman.decoder import GaussianDecoder, positional_enc
 from ihbench.methods.inpainthuman.method import InpaintHuman
 from ihbench.render.splat import render_gaussians
 from ihbench.render.splats import LOW_PASS
-from ihbench.threads import one_torch_thread
 from tests.bench.fake_capture import DISTANCE, WHITE, a_camera, a_pose, rasterized, the_body
 
 from .tiny_fit import SIZE, TINY, an_avatar, equal_bits, parameters_of, random_pose, shaken

@@ -8,15 +8,15 @@ import pytest
 import torch
 
 from ihbench.camera import Camera
+from ihbench.clock.ledger import Ledger
+from ihbench.clock.progress import Progress
+from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput, Diverged
-from ihbench.ledger import Ledger
 from ihbench.methods.inpainthuman.method import InpaintHuman
 from ihbench.methods.inpainthuman.stage1 import Stage1, body_window, loss_of, prepare_target
 from ihbench.metrics import psnr
-from ihbench.progress import Progress
 from ihbench.render.splat import render_gaussians
 from ihbench.scene import MaskState, TrainingSet
-from ihbench.threads import one_torch_thread
 from tests.bench.fake_capture import WHITE, a_camera, a_pose, the_body, train_view
 
 from .tiny_fit import SIZE, TINY, an_avatar, equal_bits, fitted, parameters_of, shaken, training_set, training_views

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import torch
 
+from ihbench.clock.ledger import Ledger
+from ihbench.clock.progress import Progress
+from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput, Diverged
-from ihbench.ledger import Ledger
 from ihbench.methods.inpainthuman.inpainting import personalise
 from ihbench.methods.inpainthuman.inpainting.diffusion_inpainter import DiffusionInpainter
 from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
 from ihbench.methods.inpainthuman.inpainting.personalise import Personaliser, best_seen
 from ihbench.methods.inpainthuman.inpainting.subject_token import ANYBODY, SubjectToken
-from ihbench.progress import Progress
-from ihbench.threads import one_torch_thread
 from tests.methods.tiny_diffusion import crops, images_equal, same, tiny_backbone, weights
 
 QUIET = Progress.silent()

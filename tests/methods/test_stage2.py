@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from ihbench.body.uv import texel_table
-from ihbench.ledger import Ledger
+from ihbench.clock.ledger import Ledger
+from ihbench.clock.progress import Progress
+from ihbench.clock.threads import one_torch_thread
 from ihbench.methods.inpainthuman import stage2
 from ihbench.methods.inpainthuman.inpainting.crop_view import cut_view, with_frames
 from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
@@ -16,9 +18,7 @@ from ihbench.methods.inpainthuman.inpainting.painted_view import paste_back
 from ihbench.methods.inpainthuman.inpainting.shown_view import orbit, turntable_view, with_known_surface
 from ihbench.methods.inpainthuman.inpainting.surface_need import SeenSurface, key_views, pixels_of, seen_surface
 from ihbench.methods.inpainthuman.stage2 import Stage2
-from ihbench.progress import Progress
 from ihbench.scene import MaskState
-from ihbench.threads import one_torch_thread
 from ihbench.visibility import surface_texels
 from tests.bench.fake_capture import a_camera, a_pose, the_body, train_view
 from tests.methods.tiny_fit import SIZE, an_avatar, shaken, training_set, training_views

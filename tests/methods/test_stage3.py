@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import torch
 
+from ihbench.clock.ledger import Ledger
+from ihbench.clock.progress import Progress
+from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput, Diverged
-from ihbench.ledger import Ledger
 from ihbench.methods.inpainthuman.config import PAPER, QUICK
 from ihbench.methods.inpainthuman.inpainting.painted_view import PaintedView
 from ihbench.methods.inpainthuman.refine_config import RefineConfig
@@ -19,9 +21,7 @@ from ihbench.methods.inpainthuman.stage3 import Stage3
 from ihbench.metrics import psnr, ssim
 from ihbench.metrics.lpips import lpips, random_networks
 from ihbench.metrics.ssim import ssim_map
-from ihbench.progress import Progress
 from ihbench.scene import MaskState, TrainView
-from ihbench.threads import one_torch_thread
 from tests.bench.fake_capture import WHITE, a_camera, a_pose, train_view
 
 from .tiny_fit import SIZE, STRIP, an_avatar, equal_bits, fitted, parameters_of, shaken, training_set, training_views

@@ -10,8 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ihbench.clock.ledger import Ledger
+from ihbench.clock.progress import Progress
+from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput
-from ihbench.ledger import Ledger
 from ihbench.methods.inpainthuman.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.config import QUICK, InpaintHumanConfig, config_from, outside_files
 from ihbench.methods.inpainthuman.inpainting.mini_weights import save_mini
@@ -19,10 +21,8 @@ from ihbench.methods.inpainthuman.inpainting.personalise import ADAPT_STATE, TI_
 from ihbench.methods.inpainthuman.method import InpaintHuman
 from ihbench.methods.inpainthuman.stage1 import Stage1, draw, loss_of, prepare_target
 from ihbench.metrics.ssim import ssim_map
-from ihbench.progress import Progress
 from ihbench.protocol import load_protocol
 from ihbench.run_loop import RunRequest, _outside
-from ihbench.threads import one_torch_thread
 from tests.bench.fake_capture import a_camera, a_pose, the_body, train_view
 from tests.methods.sd2_miniature import make_miniature
 from tests.methods.tiny_diffusion import tiny_backbone
@@ -136,12 +136,12 @@ def test_every_simple_filler_runs_without_diffusers(filler, monkeypatch):
 WHAT_IS_IMPORTED = """
 import sys
 from dataclasses import replace
-from ihbench.ledger import Ledger
+from ihbench.clock.ledger import Ledger
 from ihbench.methods.inpainthuman.config import QUICK
 from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
 from ihbench.methods.inpainthuman.method import InpaintHuman
 from ihbench.methods.inpainthuman.stage1 import Stage1
-from ihbench.progress import Progress
+from ihbench.clock.progress import Progress
 from tests.bench.fake_capture import a_camera, a_pose, train_view
 from tests.methods.tiny_fit import SIZE, TINY, training_set
 

@@ -12,6 +12,8 @@ from safetensors.torch import load_file, save_file
 
 from ihbench import bounds
 from ihbench.cli import main
+from ihbench.clock.progress import Progress
+from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput
 from ihbench.methods.inpainthuman.inpainting import (
     crop_album,
@@ -25,8 +27,6 @@ from ihbench.methods.inpainthuman.inpainting.crop_album import CropAlbum
 from ihbench.methods.inpainthuman.inpainting.mini_training import MiniTraining
 from ihbench.methods.inpainthuman.inpainting.mini_weights import load_mini, save_mini
 from ihbench.methods.inpainthuman.inpainting.train_mini import MiniTrainer, curve_of
-from ihbench.progress import Progress
-from ihbench.threads import one_torch_thread
 from tests.conftest import contents
 from tests.methods.tiny_diffusion import same, tiny_backbone, weights
 

@@ -6,8 +6,8 @@ import math
 
 import pytest
 
+from ihbench.clock.ledger import Ledger
 from ihbench.files.atomic import read_json
-from ihbench.ledger import Ledger
 from ihbench.reports.ledger_table import TOLERANCE, account, ledger_section
 from ihbench.reports.markdown import markdown
 from ihbench.results import RunResult, read_result

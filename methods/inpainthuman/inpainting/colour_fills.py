@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ihbench.clock.progress import Progress
 from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
-from ihbench.progress import Progress
 
 RADIUS = 3.0  # px, the neighbourhood that OpenCV's methods look at
 GREY = 128  # where nothing at all is known

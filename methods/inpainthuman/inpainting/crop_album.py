@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from ihbench import registry
 from ihbench.body import load_body
+from ihbench.clock.interruption import end_with_parent
+from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.npz import read_npz
-from ihbench.interruption import end_with_parent
 from ihbench.methods.inpainthuman.inpainting.part_map import part_labels
 from ihbench.methods.inpainthuman.inpainting.person_crop import PADDING, person_crop
-from ihbench.progress import Progress
 
 VERSION = 2  # of what is kept of a photograph
 PAGE = 100  # people per file

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench.ledger import Ledger
+from ihbench.clock.ledger import Ledger
+from ihbench.clock.progress import Progress
 from ihbench.methods.inpainthuman.inpainting.backbone import Backbone
 from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
 from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
 from ihbench.methods.inpainthuman.inpainting.personalise import Curve, Personaliser
 from ihbench.methods.inpainthuman.inpainting.sampling import inpaint_views
 from ihbench.methods.inpainthuman.inpainting.subject_token import ANYBODY, new_words
-from ihbench.progress import Progress
 
 
 def load_backbone(config: InpaintConfig, device: str) -> Backbone:

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from ihbench import registry
+from ihbench.clock.progress import Progress
 from ihbench.methods.inpainthuman.inpainting.backbone import Backbone
 from ihbench.methods.inpainthuman.inpainting.crop_album import PAGE, CropAlbum
 from ihbench.methods.inpainthuman.inpainting.diffusion_batch import DiffusionBatch, shared_noise
@@ -18,7 +19,6 @@ from ihbench.methods.inpainthuman.inpainting.part_map import part_colours
 from ihbench.methods.inpainthuman.inpainting.push_pull import push_pull
 from ihbench.methods.inpainthuman.inpainting.sampling import sample
 from ihbench.methods.inpainthuman.inpainting.subject_token import ANYBODY
-from ihbench.progress import Progress
 
 STEPS = (1, 6, 20)
 NOISES = (0.0, 1.0)

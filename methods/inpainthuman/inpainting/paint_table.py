@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.body import Body
+from ihbench.clock.ledger import Ledger
+from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
-from ihbench.ledger import Ledger
 from ihbench.methods.inpainthuman.inpainting.crop_view import CropView, cut_view
 from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
 from ihbench.methods.inpainthuman.inpainting.paint_rows import DIFFUSION, FILLS, FULL
 from ihbench.metrics.statistics import mean_interval, paired_test
-from ihbench.progress import Progress
 from ihbench.protocol import Protocol
 from ihbench.scene import Capture
 from ihbench.views import open_scene, uncovered

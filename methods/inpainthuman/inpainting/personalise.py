@@ -14,8 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ihbench.clock.ledger import Ledger
+from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
-from ihbench.ledger import Ledger
 from ihbench.methods.inpainthuman.inpainting.backbone import Backbone, shrink_mask
 from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
 from ihbench.methods.inpainthuman.inpainting.diffusion_batch import batch_of, by_width
@@ -24,7 +25,6 @@ from ihbench.methods.inpainthuman.inpainting.memory import ADVICE, out_of_memory
 from ihbench.methods.inpainthuman.inpainting.push_pull import push_pull
 from ihbench.methods.inpainthuman.inpainting.random_mask import SHARES, random_mask
 from ihbench.methods.inpainthuman.inpainting.subject_token import ANYBODY, SubjectToken
-from ihbench.progress import Progress
 
 TI_SHARES = (
     0.35,

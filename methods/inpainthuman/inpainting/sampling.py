@@ -7,13 +7,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ihbench.clock.ledger import Ledger
+from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput, Diverged
-from ihbench.ledger import Ledger
 from ihbench.methods.inpainthuman.inpainting.backbone import Backbone
 from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
 from ihbench.methods.inpainthuman.inpainting.diffusion_batch import DiffusionBatch, batch_of, by_width, shared_noise
 from ihbench.methods.inpainthuman.inpainting.memory import ADVICE, out_of_memory
-from ihbench.progress import Progress
 
 STATE = "stage2-sampled"
 

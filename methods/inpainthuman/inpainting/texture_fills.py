@@ -11,11 +11,11 @@ from scipy.spatial import KDTree
 
 from ihbench.body import Body
 from ihbench.body.uv import Texels, texel_table
+from ihbench.clock.progress import Progress
 from ihbench.methods.inpainthuman.inpainting.colour_fills import mean_person, on_background
 from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
 from ihbench.methods.inpainthuman.inpainting.part_map import NO_PART, smpl_parts
 from ihbench.methods.inpainthuman.inpainting.surface_colours import faced_texels, off_the_rim, pixel_texels
-from ihbench.progress import Progress
 
 Seen = tuple[NDArray[np.int32], NDArray[np.uint8]]  # texels [n], RGB [n, 3]
 NEVER = -(2**40)  # index of a view that is farther away than any

@@ -42,6 +42,7 @@ def main(argv: list[str]) -> int:
 
 
 def _train(chosen: Any) -> dict[str, Any]:
+    from ihbench.clock.progress import Progress
     from ihbench.data_source import cache_folder
     from ihbench.files import removal
     from ihbench.files.locks import locked
@@ -50,7 +51,6 @@ def _train(chosen: Any) -> dict[str, Any]:
     from ihbench.methods.inpainthuman.inpainting.mini_validation import validate
     from ihbench.methods.inpainthuman.inpainting.mini_weights import save_mini
     from ihbench.methods.inpainthuman.inpainting.train_mini import MiniTrainer
-    from ihbench.progress import Progress
 
     check_device(chosen.device)
     if chosen.out.resolve() == SHIPPED.resolve():

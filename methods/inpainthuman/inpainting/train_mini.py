@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from ihbench import registry
+from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput, Diverged
 from ihbench.files import atomic
 from ihbench.methods.inpainthuman.inpainting.backbone import Backbone, shrink_mask
@@ -26,7 +27,6 @@ from ihbench.methods.inpainthuman.inpainting.mini_model import SIZE, TEXT_WIDTH,
 from ihbench.methods.inpainthuman.inpainting.mini_training import MiniTraining
 from ihbench.methods.inpainthuman.inpainting.mini_weights import load_mini
 from ihbench.methods.inpainthuman.inpainting.part_map import part_colours
-from ihbench.progress import Progress
 
 STATE = "training.safetensors"
 CURVE = "curve.jsonl"

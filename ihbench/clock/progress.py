@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TextIO
 
+from ihbench.clock.streams import say
 from ihbench.errors import visible
-from ihbench.streams import say
 
 PLAIN_EVERY = 10.0  # s between two plain lines of one task
 MODES = ("auto", "bar", "plain", "silent")

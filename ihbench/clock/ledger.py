@@ -19,12 +19,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ihbench import interruption, machine
+from ihbench.clock import interruption, machine
 from ihbench.files.atomic import decode, encode, write_bytes
 from ihbench.files.regular import read_bytes
 
 if TYPE_CHECKING:
-    from ihbench.progress import Progress
+    from ihbench.clock.progress import Progress
 
 FIT = "fit"
 EVALUATE = "evaluate"

@@ -9,9 +9,10 @@ import tempfile
 import traceback
 from dataclasses import dataclass
 
-from ihbench import registry, streams
+from ihbench import registry
+from ihbench.clock import streams
+from ihbench.clock.interruption import reason_of, status_of
 from ihbench.errors import BadInput, Diverged, visible
-from ihbench.interruption import reason_of, status_of
 
 DEBUG = "IHBENCH_DEBUG"  # environment variable: print tracebacks, too
 REPORT_TO = "please report it with that traceback"
