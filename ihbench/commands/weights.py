@@ -8,8 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from ihbench import weights
 from ihbench.commands.parse import options
+from ihbench.metrics import weights
 
 
 @dataclass(frozen=True)

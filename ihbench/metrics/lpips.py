@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from ihbench.errors import BadInput
 from ihbench.files.tensors import read_tensors
 from ihbench.metrics.images import as_background, as_mask, bounds, checked, peak_of
-from ihbench.weights import FILES, locate
+from ihbench.metrics.weights import FILES, locate
 
 NETS = ("vgg", "alex", "squeeze")
 FEEDS = ("[-1,1]", "[0,1]")

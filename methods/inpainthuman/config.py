@@ -14,8 +14,8 @@ from ihbench.bounds import STEPS, MultipleOf, Within, check
 from ihbench.errors import BadInput
 from ihbench.methods.inpainthuman.inpainting.inpaint_config import PAPER_INPAINT, QUICK_INPAINT, InpaintConfig
 from ihbench.methods.inpainthuman.refine_config import PAPER_REFINE, QUICK_REFINE, RefineConfig
+from ihbench.metrics.weights import FILES, locate
 from ihbench.plan import Omission, SceneMeasure
-from ihbench.weights import FILES, locate
 
 WEIGHT, RATE = Within(0, 1e6), Within(0, 1000)  # of a term of the loss; a step size
 STATIC_DEG = 5.0  # below this joint motion nothing depends on the pose

@@ -13,11 +13,10 @@ import numpy as np
 import pytest
 import torch
 
-from ihbench import weights
 from ihbench.cli import main
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
-from ihbench.metrics import evaluate, lpips
+from ihbench.metrics import evaluate, lpips, weights
 from ihbench.metrics.cases import person_case
 from ihbench.metrics.check import package_distance
 

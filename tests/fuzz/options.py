@@ -269,7 +269,7 @@ def cut_short() -> Iterator[None]:
 
     places = (
         *("ihbench.run_loop.run_scene", "ihbench.cells.run_scene", "ihbench.metrics.check.check"),
-        *("ihbench.stress.run.run_cases", "ihbench.kernels.table.run_kernels", "ihbench.weights.fetch"),
+        *("ihbench.stress.run.run_cases", "ihbench.kernels.table.run_kernels", "ihbench.metrics.weights.fetch"),
         "ihbench.methods.inpainthuman.inpainting.paint_table.paint_scene",
         "ihbench.methods.inpainthuman.inpainting.crop_album.CropAlbum.make",
         "ihbench.datasets.standin.photograph.photograph",

@@ -277,7 +277,7 @@ def test_weights_outside_the_package_are_part_of_a_runs_identity(mini):
 
 
 def test_lpips_weights_that_come_later_make_another_run(mini, tmp_path, monkeypatch):
-    from ihbench import weights
+    from ihbench.metrics import weights
 
     given = config(mini)
     given = replace(given, refine=replace(given.refine, lpips=0.1))
