@@ -14,7 +14,7 @@ from ihbench.clock import streams
 from ihbench.commands.parse import options
 
 if TYPE_CHECKING:
-    from ihbench.metrics.check import Comparison
+    from ihbench.metrics.oracles.check import Comparison
 
 
 TABLE_WIDTH = 165  # characters; a narrower terminal would cut the numbers
@@ -34,7 +34,7 @@ class Check:
 
 def main(argv: list[str]) -> int:
     chosen = options(Check, argv, "metrics", "Check the metrics against oracles, libraries and stored values.")
-    from ihbench.metrics.check import check, mismatches
+    from ihbench.metrics.oracles.check import check, mismatches
 
     found = check(examples=chosen.lpips_examples)
     wrong = mismatches(found)

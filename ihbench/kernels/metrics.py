@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ihbench.clock.threads import one_torch_thread, single_threaded_libraries
 from ihbench.errors import BadInput
 from ihbench.kernels.measuring import Row, interleave, peak_mib, summary
-from ihbench.metrics.cases import Case, hashed, person_case
+from ihbench.metrics.oracles.cases import Case, hashed, person_case
 
 if TYPE_CHECKING:
     from ihbench.metrics.evaluate import Preset
@@ -41,7 +41,7 @@ Metric = Callable[..., float]  # of two images
 
 def ssim_rows(repeats: int, size: int = SIZE) -> list[Row]:
     """SSIM of a frame on one core: ours for every dtype, scikit-image, torchmetrics, kornia, our loss in torch."""
-    from ihbench.metrics.oracle import ssim_oracle
+    from ihbench.metrics.oracles.oracle import ssim_oracle
     from ihbench.metrics.ssim import ssim
 
     others: dict[str, tuple[type, Metric, str]] = {"torch loss f32": (np.float32, _ssim_torch, "mirror")}
@@ -71,7 +71,7 @@ def ssim_rows(repeats: int, size: int = SIZE) -> list[Row]:
 def flip_rows(repeats: int, size: int = SIZE) -> list[Row]:
     """FLIP of a frame on one core: ours for every dtype, and NVIDIA's evaluator."""
     from ihbench.metrics.flip import flip
-    from ihbench.metrics.flip_oracle import flip_oracle
+    from ihbench.metrics.oracles.flip_oracle import flip_oracle
 
     steps: dict[str, tuple[type, Metric, str]] = {_short(t): (t, flip, "") for t in DTYPES}
     if find_spec("flip_evaluator") is not None:
@@ -114,7 +114,7 @@ def lpips_rows(repeats: int, size: int = SIZE, nets: Sequence[str] | None = None
 def _lpips_steps(network: Network, net: str, tile: int) -> dict[str, Metric]:
     """Ways to the same number, and to that of a crop; `body` is the figure's region in a frame of any size."""
     from ihbench.metrics import lpips
-    from ihbench.metrics.check import package_distance
+    from ihbench.metrics.oracles.check import package_distance
 
     return {
         "ours f32": partial(lpips.lpips, net=net),
@@ -164,7 +164,7 @@ def frame_rows(repeats: int, size: int = SIZE) -> list[Row]:
     The figure takes a twentieth of the frame, as a stand-in's person does, or more.
     """
     from ihbench.metrics.evaluate import evaluate
-    from ihbench.metrics.presets_oracle import preset_oracle
+    from ihbench.metrics.oracles.presets_oracle import preset_oracle
 
     rows = []
     for share, extent in FIGURES.items():

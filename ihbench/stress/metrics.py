@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from ihbench.metrics import mean_over_frames, psnr, ssim
 from ihbench.metrics.aggregate import Score
-from ihbench.metrics.cases import hashed
 from ihbench.metrics.flip import flip
-from ihbench.metrics.flip_oracle import flip_oracle
-from ihbench.metrics.oracle import psnr_oracle, ssim_oracle
+from ihbench.metrics.oracles.cases import hashed
+from ihbench.metrics.oracles.flip_oracle import flip_oracle
+from ihbench.metrics.oracles.oracle import psnr_oracle, ssim_oracle
 from ihbench.metrics.psnr import mean_of_channels
 from ihbench.metrics.statistics import mean_interval, paired_test, smallest_detectable_difference
 from ihbench.stress.case import Answer, Case, Unit

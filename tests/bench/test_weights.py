@@ -17,8 +17,8 @@ from ihbench.cli import main
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.metrics import evaluate, lpips, weights
-from ihbench.metrics.cases import person_case
-from ihbench.metrics.check import package_distance
+from ihbench.metrics.oracles.cases import person_case
+from ihbench.metrics.oracles.check import package_distance
 
 SQUEEZE = "lpips-squeeze"
 

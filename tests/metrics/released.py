@@ -1,6 +1,6 @@
 """The released evaluators restated with the libraries they call: independent of everything under `ihbench/metrics`.
 
-`python -m tests.metrics.released` prints the numbers that `ihbench/metrics/reference_values.py` holds.
+`python -m tests.metrics.released` prints the numbers that `ihbench/metrics/oracles/reference_values.py` holds.
 """
 
 from __future__ import annotations
@@ -175,7 +175,7 @@ RELEASED = {
 
 
 if __name__ == "__main__":
-    from ihbench.metrics.cases import person_case
+    from ihbench.metrics.oracles.cases import person_case
 
     case = person_case(96, 80, dtype=np.uint8)
     for name, restated in RELEASED.items():

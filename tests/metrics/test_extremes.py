@@ -148,7 +148,7 @@ def test_tiny_variance_on_a_large_mean(dtype):
     levels = 250 + np.random.default_rng(0).integers(0, 2, (2, 40, 40, 3))
     x, y = (as_type(level / 255, dtype) for level in levels)
     a, b = as_float64(x), as_float64(y)
-    from ihbench.metrics.oracle import ssim_oracle
+    from ihbench.metrics.oracles.oracle import ssim_oracle
 
     assert ssim(x, y) == pytest.approx(ssim_oracle(a[:16, :16], b[:16, :16]), abs=0.05)
     assert ssim(x[:16, :16], y[:16, :16]) == pytest.approx(ssim_oracle(a[:16, :16], b[:16, :16]), abs=1e-10)

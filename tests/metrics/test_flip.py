@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 
 from ihbench.metrics.flip import PPD, Filters, flip, flip_map, mean_flip
 from ihbench.metrics.flip_numba import STRIP
-from ihbench.metrics.flip_oracle import flip_map_oracle, flip_oracle
 from ihbench.metrics.images import differing_pixels
+from ihbench.metrics.oracles.flip_oracle import flip_map_oracle, flip_oracle
 
 # NVIDIA's evaluator computes in float32. On flat patches its edge filters leave rounding errors of 1e-7, and the
 # square root in the feature difference turns them into 3e-4, which moves the map by up to a third of that.

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from ihbench import registry
-from ihbench.metrics import check as checking
 from ihbench.metrics import evaluate, lpips
-from ihbench.metrics.cases import person_case
-from ihbench.metrics.check import mismatches
 from ihbench.metrics.evaluate import find_preset
+from ihbench.metrics.oracles import check as checking
+from ihbench.metrics.oracles.cases import person_case
+from ihbench.metrics.oracles.check import mismatches
 from tests.metrics.released import RELEASED
 
 NAMES = ["ihbench", "neuralbody", "humannerf", "occnerf", "gauhuman", "3dgs-avatar-zju", "instantavatar", "gtu-mask"]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from ihbench.metrics import psnr
-from ihbench.metrics.oracle import psnr_oracle
+from ihbench.metrics.oracles.oracle import psnr_oracle
 
 rng = np.random.default_rng(0)
 

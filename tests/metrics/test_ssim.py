@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from skimage.metrics import structural_similarity
 
 from ihbench.metrics import ssim, ssim_map
-from ihbench.metrics.oracle import ssim_map_oracle, ssim_oracle
+from ihbench.metrics.oracles.oracle import ssim_map_oracle, ssim_oracle
 
 
 def pair(shape, seed: int = 0, noise: float = 0.2):

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ihbench.metrics import ssim_map
-from ihbench.metrics.oracle import ssim_map_oracle
+from ihbench.metrics.oracles.oracle import ssim_map_oracle
 from ihbench.metrics.ssim_torch import ssim_map_torch
 
 

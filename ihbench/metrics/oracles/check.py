@@ -20,13 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.metrics import lpips
-from ihbench.metrics.cases import Case, person_case
 from ihbench.metrics.evaluate import Preset, evaluate, find_preset
 from ihbench.metrics.flip import flip
-from ihbench.metrics.oracle import psnr_channels_oracle
-from ihbench.metrics.presets_oracle import ORACLES, preset_oracle
+from ihbench.metrics.oracles.cases import Case, person_case
+from ihbench.metrics.oracles.oracle import psnr_channels_oracle
+from ihbench.metrics.oracles.presets_oracle import ORACLES, preset_oracle
+from ihbench.metrics.oracles.reference_values import STORED
 from ihbench.metrics.psnr import mean_of_channels, psnr
-from ihbench.metrics.reference_values import STORED
 from ihbench.metrics.ssim import Window, ssim, ssim_map
 
 BACKGROUNDS = {"": (1.0, 1.0, 1.0), ", tinted": (0.2, 0.4, 0.6)}

@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench.metrics.flip_oracle import flip_oracle
-from ihbench.metrics.oracle import psnr_channels_oracle, psnr_oracle, ssim_map_oracle, ssim_oracle
+from ihbench.metrics.oracles.flip_oracle import flip_oracle
+from ihbench.metrics.oracles.oracle import psnr_channels_oracle, psnr_oracle, ssim_map_oracle, ssim_oracle
 
 Image = NDArray[np.float64]  # [H, W, 3]
 Masks = Mapping[str, NDArray[np.bool_]]

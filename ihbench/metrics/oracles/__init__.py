@@ -1,0 +1,1 @@
+"""Independent answers that the metrics are held against: oracles, other libraries, stored values."""
