@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ihbench import diagram, outputs
+from ihbench import outputs
+from ihbench.document import diagram
 from ihbench.metrics import Identity
 from ihbench.metrics.identity import METRICS
 from ihbench.metrics.statistics import Interval, interval_ends

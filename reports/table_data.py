@@ -8,7 +8,7 @@ import json
 import math
 from typing import Any
 
-from ihbench.diagram import harmless
+from ihbench.document.diagram import harmless
 from ihbench.files import atomic
 from ihbench.reports.paper_table import Block, Cell, Frame, Row
 

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ihbench import diagram, outputs
+from ihbench import outputs
+from ihbench.document import diagram
 from ihbench.kernels.measuring import Row
 
 COLUMNS = 3

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from ihbench import diagram
 from ihbench.body import load_body, position_map, texel_table
+from ihbench.document import diagram
 from ihbench.errors import BadInput
 from ihbench.kernels import figure, metrics, position_maps, scoring, skinning, splats, table, zbuffers
 from ihbench.kernels.measuring import interleave, peak_mib, summary

@@ -9,8 +9,9 @@ import sys
 
 import pytest
 
-from ihbench import diagram, outputs
+from ihbench import outputs
 from ihbench.cli import main
+from ihbench.document import diagram
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from tests.conftest import contents

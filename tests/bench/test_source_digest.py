@@ -59,7 +59,12 @@ OF_THE_BENCH = [
 OF_THE_METHOD = ["methods/inpainthuman/stage1.py", "methods/inpainthuman/inpainting/sampling.py"]
 OF_NO_NUMBER = [
     *("ihbench/cli.py", "ihbench/commands/run.py", "ihbench/kernels/splats.py", "ihbench/stress/splat.py"),
-    *("ihbench/metrics/oracles/check.py", "ihbench/diagram.py", "ihbench/row_labels.py", "protocols/zju_occ.toml"),
+    *(
+        "ihbench/metrics/oracles/check.py",
+        "ihbench/document/diagram.py",
+        "ihbench/row_labels.py",
+        "protocols/zju_occ.toml",
+    ),
     *("methods/inpainthuman/card.toml", "methods/inpainthuman/METHOD.md"),
 ]
 

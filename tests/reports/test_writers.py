@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from ihbench import diagram
+from ihbench.document import diagram
 from ihbench.errors import BadInput, Diverged
 from ihbench.reports import html, latex, markdown, table_html
 from ihbench.reports.content import general_report
