@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ihbench.layout_choice import LayoutChoice
+from ihbench.scene.layout_choice import LayoutChoice
 
 ZJU_MOCAP = LayoutChoice(
     "zju_mocap",

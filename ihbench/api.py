@@ -22,12 +22,12 @@ from ihbench.commands.keep import check_keep
 from ihbench.commands.scene_choice import OcclusionChoice, ProtocolChanges
 from ihbench.errors import BadInput
 from ihbench.files.paths import user_path
-from ihbench.protocol import Protocol, load_protocol
 from ihbench.results import RunResult
+from ihbench.scene.protocol import Protocol, load_protocol
 
 if TYPE_CHECKING:
     from ihbench.body import Body
-    from ihbench.views import OccludedScene
+    from ihbench.scene.views import OccludedScene
 
 Occlusion = str | Mapping[str, Any] | None  # a rule's name, or rule, fraction, covers as on the command line
 
@@ -100,8 +100,8 @@ def run(
              seed=seed, device=device, force=force, keep=keep, progress=progress),
         dict(image_size=image_size, train_frames=train_frames, test_frames=test_frames), occlusion,
     )  # fmt: skip
-    from ihbench.data_source import locate
     from ihbench.run_loop import RunRequest, configuration, run_scene
+    from ihbench.scene.data_source import locate
 
     check_device(given.device)
     chosen = given.chosen()
@@ -135,8 +135,8 @@ def load_scene(
         dict(protocol=protocol, scene=scene, profile=profile, data=data, body=body, progress=progress),
         dict(image_size=image_size, train_frames=train_frames, test_frames=test_frames), occlusion,
     )  # fmt: skip
-    from ihbench.data_source import locate
-    from ihbench.views import open_scene
+    from ihbench.scene.data_source import locate
+    from ihbench.scene.views import open_scene
 
     chosen = given.chosen()
     capture, model = locate(chosen, given.data, (given.scene,)).open(given.scene, given.body, given.progress)

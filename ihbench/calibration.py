@@ -17,8 +17,8 @@ from ihbench.body.pose import BodyPose
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera
 from ihbench.render.zbuffer import rasterize
-from ihbench.scene import MaskState, TestView, TrainView
-from ihbench.visibility import surface_texels
+from ihbench.scene.contracts import MaskState, TestView, TrainView
+from ihbench.scene.visibility import surface_texels
 
 if TYPE_CHECKING:
     from ihbench.body import Body

@@ -16,10 +16,10 @@ from ihbench.clock.failures import one_line
 from ihbench.clock.gpu_slots import only
 from ihbench.clock.interruption import GRACE, end_with_parent, interruptible, reason_of
 from ihbench.clock.progress import Progress
-from ihbench.data_source import DataSource
 from ihbench.errors import BadInput
 from ihbench.results import RunResult, read_result
 from ihbench.run_loop import RunRequest, run_scene
+from ihbench.scene.data_source import DataSource
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 

@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
-from ihbench.regions import HIDDEN, NEVER_SEEN
-from ihbench.views import straight_camera
+from ihbench.scene.regions import HIDDEN, NEVER_SEEN
+from ihbench.scene.views import straight_camera
 
 if TYPE_CHECKING:
+    from ihbench.scene.views import TestViewKey
     from ihbench.scoring import Scorer
-    from ihbench.views import TestViewKey
 
 SIDE = 64  # px, longer side at which bodies are drawn to count what they show
 SHARES_COUNT = 3.0  # weight of the regions' shares beside the camera's direction and the frame: they move scores most

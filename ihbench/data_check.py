@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from ihbench import outputs, registry
 from ihbench.errors import BadInput
-from ihbench.protocol import Protocol, load_protocol
-from ihbench.scene import Capture
+from ihbench.scene.contracts import Capture
+from ihbench.scene.protocol import Protocol, load_protocol
 
 if TYPE_CHECKING:
     from ihbench.body import Body

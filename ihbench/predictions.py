@@ -32,7 +32,7 @@ from ihbench.files.images import ALPHAS, read_channels, read_image
 from ihbench.files.name_pattern import NamePattern
 from ihbench.files.pictures import Header, header_of
 from ihbench.metrics.images import Color
-from ihbench.views import TestViewKey
+from ihbench.scene.views import TestViewKey
 
 DEFAULT_PATTERNS = ("{scene}/{camera}/{frame:06d}.png", "{camera}/{frame:06d}.png")
 WORDS, NUMBERS = ("scene", "camera"), ("camera_index", "frame", "index")  # placeholders

@@ -28,9 +28,9 @@ from ihbench.camera import Camera
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.files import atomic, locks, removal
-from ihbench.scene import MaskState, TrainView
+from ihbench.scene.contracts import MaskState, TrainView
+from ihbench.scene.views import OccludedScene
 from ihbench.version import __version__
-from ihbench.views import OccludedScene
 
 MANIFEST = "manifest.json"
 TEST_VIEWS = "test_views.json"
@@ -271,7 +271,7 @@ def _write(
 def _test_views(scene: OccludedScene, body: Body) -> Iterator[dict[str, Any]]:
     """The cameras and poses to draw, and the file names under which `ihbench score` looks for the drawings."""
     from ihbench.body import zju_root
-    from ihbench.views import straight_camera
+    from ihbench.scene.views import straight_camera
 
     lenses: dict[int, Camera] = {}
     for key in scene.test_keys:

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ihbench import registry
-from ihbench.data_source import DataSource, locate, own_data, standin_root
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.prepare import MANIFEST
-from ihbench.protocol import Protocol, protocol_from
-from ihbench.scene import Capture
+from ihbench.scene.contracts import Capture
+from ihbench.scene.data_source import DataSource, locate, own_data, standin_root
+from ihbench.scene.protocol import Protocol, protocol_from
 
 if TYPE_CHECKING:
     from ihbench.body import Body

@@ -6,14 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ihbench.body import load_body
-from ihbench.capture_digest import capture_digest
-from ihbench.data_source import open_capture, own_body, own_data, standin_root
 from ihbench.errors import BadInput
-from ihbench.protocol import Protocol, load_protocol, protocol_from
 from ihbench.record import outcome_fault
-from ihbench.scene import Capture
+from ihbench.scene.capture_digest import capture_digest
+from ihbench.scene.contracts import Capture
+from ihbench.scene.data_source import open_capture, own_body, own_data, standin_root
+from ihbench.scene.protocol import Protocol, load_protocol, protocol_from
+from ihbench.scene.views import OccludedScene, open_scene
 from ihbench.store import RunFolder
-from ihbench.views import OccludedScene, open_scene
 
 if TYPE_CHECKING:
     from ihbench.body import Body

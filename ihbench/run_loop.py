@@ -20,26 +20,26 @@ from numpy.typing import NDArray
 
 from ihbench import bounds, registry
 from ihbench.bounds import SEEDS
-from ihbench.capture_digest import capture_digest
 from ihbench.clock import machine
 from ihbench.clock.progress import Progress
 from ihbench.config_fields import flat, with_fields
 from ihbench.curve_views import curve_views
-from ihbench.data_source import DataSource
 from ihbench.errors import BadInput
 from ihbench.metrics import mean_over_frames
-from ihbench.plan import Omission, SceneMeasure, absent_regions, measure_scene
-from ihbench.protocol import Protocol
 from ihbench.provenance import command
 from ihbench.recorded_run import RecordedRun, about_scene, recorded
 from ihbench.reopen import reopen_body, reopen_capture
 from ihbench.results import RunResult
-from ihbench.scene import Avatar, Capture, Method, TestView, TrainingSet
+from ihbench.scene.capture_digest import capture_digest
+from ihbench.scene.contracts import Avatar, Capture, Method, TestView, TrainingSet
+from ihbench.scene.data_source import DataSource
+from ihbench.scene.plan import Omission, SceneMeasure, absent_regions, measure_scene
+from ihbench.scene.protocol import Protocol
+from ihbench.scene.views import OccludedScene, open_scene
 from ihbench.score_stage import ScoreStage
 from ihbench.scoring import Scorer
 from ihbench.source_digest import code_of, shipped_digest
 from ihbench.store import RunFolder, RunIdentity, is_finished
-from ihbench.views import OccludedScene, open_scene
 
 if TYPE_CHECKING:
     from ihbench.body import Body

@@ -6,22 +6,22 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ihbench.capture_digest import capture_digest
 from ihbench.clock.progress import Progress
-from ihbench.data_source import DataSource
 from ihbench.prediction_doubts import Doubts
 from ihbench.predictions import Predictions, find_alpha, find_predictions
 from ihbench.prepared import Prepared
-from ihbench.protocol import Protocol
 from ihbench.provenance import command
 from ihbench.recorded_run import RecordedRun, about_scene, recorded
 from ihbench.results import RunResult, read_result
+from ihbench.scene.capture_digest import capture_digest
+from ihbench.scene.data_source import DataSource
+from ihbench.scene.protocol import Protocol
+from ihbench.scene.views import OccludedScene, open_scene
 from ihbench.score_stage import ScoreStage
 from ihbench.scoring import Scorer
 from ihbench.source_digest import bench_code
 from ihbench.store import RunFolder, RunIdentity
 from ihbench.version import __version__
-from ihbench.views import OccludedScene, open_scene
 
 if TYPE_CHECKING:
     from ihbench.body import Body

@@ -20,10 +20,10 @@ from ihbench.files.images import write_png
 from ihbench.metrics.eight_bit import rounded
 from ihbench.record import score_lines
 from ihbench.results import group_row, view_rows
+from ihbench.scene.views import OccludedScene
 from ihbench.scoring import LoadedView, Predictor, Scorer
 from ihbench.source_digest import bench_code
 from ihbench.store import RunFolder
-from ihbench.views import OccludedScene
 
 if TYPE_CHECKING:
     from ihbench.body import Body

@@ -19,11 +19,11 @@ from ihbench.metrics.eight_bit import rounded
 from ihbench.metrics.evaluate import Preset, evaluate, find_preset
 from ihbench.metrics.identity import Score
 from ihbench.metrics.images import as_image, check_range
-from ihbench.occlusion import withheld
-from ihbench.regions import SurfaceMap
-from ihbench.scene import TestView
-from ihbench.views import OccludedScene, TestViewKey
-from ihbench.visibility import Visibility, texel_visibility
+from ihbench.scene.contracts import TestView
+from ihbench.scene.occlusion import withheld
+from ihbench.scene.regions import SurfaceMap
+from ihbench.scene.views import OccludedScene, TestViewKey
+from ihbench.scene.visibility import Visibility, texel_visibility
 
 if TYPE_CHECKING:
     from ihbench.body import Body

@@ -27,7 +27,7 @@ from ihbench.errors import BadInput
 from ihbench.version import __version__
 
 if TYPE_CHECKING:
-    from ihbench.protocol import Protocol
+    from ihbench.scene.protocol import Protocol
 
 BENCH = Path(__file__).resolve().parent
 # of the bench: commands, what only shows or checks numbers, and the rooms, which are asked for one by one

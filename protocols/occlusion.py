@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.errors import BadInput
-from ihbench.occlusion import Mask, Occlusion, OcclusionRequest, grown_for_clothes, occluder
+from ihbench.scene.occlusion import Mask, Occlusion, OcclusionRequest, grown_for_clothes, occluder
 
 BLOCKS_ACROSS = 12  # random blocks along the longer side of the person
 

@@ -15,7 +15,6 @@ from typing import Any, Literal
 from ihbench.calibration import DESCRIPTIONS, ROWS
 from ihbench.metrics import Identity, Mean, macro_mean
 from ihbench.metrics.statistics import Interval, mean_interval
-from ihbench.protocol import REGIONS
 from ihbench.reports.marks import marks_by_interval, marks_by_value
 from ihbench.reports.paper_numbers import Column, Component, Group, PaperTable
 from ihbench.reports.short_names import Footnotes, split_label
@@ -23,6 +22,7 @@ from ihbench.reports.significance import LEVEL, scene_means
 from ihbench.results import RunResult, group_row
 from ihbench.row_choice import EVERYTHING, Choice
 from ihbench.row_labels import by_label
+from ihbench.scene.protocol import REGIONS
 
 Kind = Literal["quoted", "real data", "stand-in"]
 MEASURED = {"real data": "measured", "stand-in": "stand-in"}  # a block's kind -> the status of its numbers

@@ -22,8 +22,8 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # a process a core: more threads would 
 
 from ihbench import registry
 from ihbench.cli import main
-from ihbench.data_source import STANDIN_SEED, standin_root, wanted_frames
-from ihbench.protocol import load_protocol
+from ihbench.scene.data_source import STANDIN_SEED, standin_root, wanted_frames
+from ihbench.scene.protocol import load_protocol
 
 # 5 training views (4 of them occluded), 2 × 2 test views, 64 px
 TINY_PROFILE = """[profile.quick]

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ihbench.ablation import Ladder
     from ihbench.cells import Cell, CellOutcome
     from ihbench.clock.progress import Progress
-    from ihbench.data_source import DataSource
+    from ihbench.scene.data_source import DataSource
 
 BETWEEN = ":"  # values of one switch
 
@@ -188,9 +188,9 @@ def _cells(chosen: AblateOptions, ladder: Ladder, progress: Any) -> list[tuple[s
     """Rung and cell of every run: seeds outermost, so that an early table holds every rung."""
     from ihbench.ablation import configured, kept, shared_part
     from ihbench.cells import Cell
-    from ihbench.data_source import locate
-    from ihbench.protocol import load_protocol
     from ihbench.run_loop import RunRequest
+    from ihbench.scene.data_source import locate
+    from ihbench.scene.protocol import load_protocol
 
     config = profile_of(chosen)
     check_keep(chosen.keep, config)

@@ -64,7 +64,7 @@ def main(argv: list[str]) -> int:
 def _check(chosen: Check) -> int:
     from ihbench.body import load_body
     from ihbench.data_check import add_fitness
-    from ihbench.data_source import body_file, folder_nearby, is_about_a_file, own_body, own_data
+    from ihbench.scene.data_source import body_file, folder_nearby, is_about_a_file, own_body, own_data
 
     folder = own_data(chosen.folder)
     assert folder is not None
@@ -108,8 +108,8 @@ def _lines(value: Any, indent: str = "") -> Iterator[str]:
 
 def _standin(chosen: Standin) -> int:
     from ihbench.clock.progress import Progress
-    from ihbench.data_source import wanted_frames
-    from ihbench.protocol import load_protocol
+    from ihbench.scene.data_source import wanted_frames
+    from ihbench.scene.protocol import load_protocol
 
     standin = registry.load("stand-in", chosen.dataset)
     protocol = load_protocol(chosen.protocol or standin.protocol, chosen.profile)

@@ -14,7 +14,7 @@ from ihbench.cli import COMMANDS
 from ihbench.commands.parse import options
 from ihbench.errors import BadInput
 from ihbench.files.regular import read_toml
-from ihbench.protocol import load_protocol
+from ihbench.scene.protocol import load_protocol
 
 KINDS = ("methods", "datasets", "protocols", "reports", "metrics")
 

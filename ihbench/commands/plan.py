@@ -13,12 +13,12 @@ from ihbench.commands.scene_choice import SceneChoice
 from ihbench.errors import BadInput
 
 if TYPE_CHECKING:
-    from ihbench.protocol import Protocol
+    from ihbench.scene.protocol import Protocol
 
 
 def main(argv: list[str]) -> int:
     chosen = options(SceneChoice, argv, "plan", "What a run would do, what is left out and why. Runs nothing.")
-    from ihbench.protocol import load_protocol
+    from ihbench.scene.protocol import load_protocol
 
     protocols = chosen.apply(load_protocol(chosen.protocol, chosen.profile))
     reports = [_planned(chosen, protocol) for protocol in protocols]
@@ -32,10 +32,10 @@ def main(argv: list[str]) -> int:
 
 def _planned(chosen: SceneChoice, protocol: Protocol) -> dict[str, Any]:
     from ihbench.clock.machine import cpu_model
-    from ihbench.data_source import locate, open_capture
     from ihbench.earlier_runs import earlier_runs
-    from ihbench.plan import absent_regions, measure_scene
     from ihbench.run_loop import configuration
+    from ihbench.scene.data_source import locate, open_capture
+    from ihbench.scene.plan import absent_regions, measure_scene
     from ihbench.source_digest import code_of
 
     config = configuration(chosen.method, chosen.profile, {})

@@ -45,10 +45,10 @@ def main(argv: list[str]) -> int:
     chosen = options(PrepareOptions, argv, "prepare", "Write the occluded training set, and nothing that it hides.")
     from ihbench import registry
     from ihbench.clock.progress import Progress
-    from ihbench.data_source import locate, own_body
     from ihbench.prepare import check_target, prepare
-    from ihbench.protocol import load_protocol
-    from ihbench.views import open_scene
+    from ihbench.scene.data_source import locate, own_body
+    from ihbench.scene.protocol import load_protocol
+    from ihbench.scene.views import open_scene
 
     protocols = chosen.apply(load_protocol(chosen.protocol, chosen.profile))
     if len(protocols) > 1:

@@ -10,8 +10,8 @@ import tyro
 
 from ihbench.commands.parse import options
 from ihbench.commands.scene_choice import ProtocolChanges
-from ihbench.occlusion import withheld
-from ihbench.protocol import Protocol, difference, flatten, load_protocol
+from ihbench.scene.occlusion import withheld
+from ihbench.scene.protocol import Protocol, difference, flatten, load_protocol
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -96,9 +96,9 @@ def _run(chosen: Any) -> int:
     from dataclasses import replace
 
     from ihbench.clock.progress import Progress
-    from ihbench.data_source import locate
-    from ihbench.protocol import load_protocol
     from ihbench.run_loop import RunRequest, run_scene
+    from ihbench.scene.data_source import locate
+    from ihbench.scene.protocol import load_protocol
 
     protocols = chosen.apply(load_protocol(chosen.protocol, chosen.profile))
     check_keep(chosen.keep, chosen.config)
@@ -124,9 +124,9 @@ def _repeat(chosen: LikeOptions) -> int:
     check_device(chosen.device)
     registry.entry_point("report", "md")
     from ihbench.clock.progress import Progress
-    from ihbench.data_source import locate
     from ihbench.repeat import differences, repetition
     from ihbench.run_loop import run_scene
+    from ihbench.scene.data_source import locate
 
     progress = Progress()
     again = repetition(chosen.like, chosen.runs, chosen.body, chosen.device, chosen.force)

@@ -10,7 +10,7 @@ from ihbench import registry
 from ihbench.bounds import IMAGE_SIZES, Within, refuse_repeated
 
 if TYPE_CHECKING:
-    from ihbench.protocol import Protocol
+    from ihbench.scene.protocol import Protocol
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from ihbench.clock.progress import Progress
-    from ihbench.data_source import DataSource
     from ihbench.prepared import Prepared
     from ihbench.results import RunResult
+    from ihbench.scene.data_source import DataSource
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,9 +107,9 @@ def scored(chosen: ScoreOptions, progress: Progress) -> list[RunResult]:
 
 def _source(chosen: ScoreOptions) -> tuple[DataSource, Prepared | None]:
     """What is scored: under which protocol, on which data, and what was prepared of it."""
-    from ihbench.data_source import locate
     from ihbench.prepared import read_prepared
-    from ihbench.protocol import PROFILES, load_protocol
+    from ihbench.scene.data_source import locate
+    from ihbench.scene.protocol import PROFILES, load_protocol
 
     if (chosen.protocol is None) == (chosen.prepared is None):
         raise BadInput("score: give either --protocol, or with --prepared the folder that `ihbench prepare` wrote")

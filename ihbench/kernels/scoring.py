@@ -27,12 +27,12 @@ def score_rows(repeats: int, views: int = VIEWS, profile: str = PROFILE) -> list
     The predictions are the truth a pixel off. `repeats` above 3 are 3.
     """
     from ihbench.clock.progress import Progress
-    from ihbench.data_source import locate
     from ihbench.files.images import read_image, write_png
     from ihbench.metrics.eight_bit import rounded
-    from ihbench.protocol import load_protocol
+    from ihbench.scene.data_source import locate
+    from ihbench.scene.protocol import load_protocol
+    from ihbench.scene.views import open_scene
     from ihbench.scoring import Scorer
-    from ihbench.views import open_scene
 
     protocol = load_protocol(PROTOCOL, profile)
     source = locate(protocol, None, (protocol.standin_subjects[0],))

@@ -25,10 +25,12 @@ from ihbench.errors import BadInput
 from ihbench.files.atomic import read_json, write_json
 from ihbench.files.images import read_image
 from ihbench.files.safe_pickle import load_npy, load_pickle
-from ihbench.occlusion import apply_rule
-from ihbench.plan import measure_scene
-from ihbench.protocol import Protocol, Span
-from ihbench.scene import MaskState
+from ihbench.scene.contracts import MaskState
+from ihbench.scene.occlusion import apply_rule
+from ihbench.scene.plan import measure_scene
+from ihbench.scene.protocol import Protocol, Span
+from ihbench.scene.views import OccludedScene, open_scene
+from ihbench.scene.visibility import texel_visibility
 from ihbench.scoring import Scorer
 from ihbench.stress.case import Answer, Case, Unit, words_of
 from ihbench.stress.drawn_capture import (
@@ -42,8 +44,6 @@ from ihbench.stress.drawn_capture import (
     train_view,
     turning_capture,
 )
-from ihbench.views import OccludedScene, open_scene
-from ihbench.visibility import texel_visibility
 
 COUNT = "pixels, texels and views are counted"
 REFUSED = "it must be refused, and the line must say this"

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from ihbench.body import JOINT_INDEX, Body, load_body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera, look_at
-from ihbench.protocol import Protocol, Span, load_protocol
 from ihbench.render.zbuffer import Raster, rasterize
-from ihbench.scene import MaskState, TrainView
+from ihbench.scene.contracts import MaskState, TrainView
+from ihbench.scene.protocol import Protocol, Span, load_protocol
 
 SIZE = 96  # px
 DISTANCE = 3.0  # m
@@ -85,7 +85,7 @@ def untouched(_camera: int, _frame: int, pixels: NDArray) -> NDArray:
 
 @dataclass(eq=False)
 class DrawnCapture:
-    """`ihbench.scene.Capture` of some poses seen by some cameras; `edit_*` change pixels as they are read."""
+    """`ihbench.scene.contracts.Capture` of some poses seen by some cameras; `edit_*` change pixels as they are read."""
 
     poses: Sequence[BodyPose]
     cameras: Sequence[Camera]

@@ -19,8 +19,8 @@ from ihbench.body.pose import BodyPose
 from ihbench.body.root_convention import from_zju_root, zju_root
 from ihbench.camera import Camera, distort, look_at
 from ihbench.errors import BadInput
-from ihbench.regions import projected_box
 from ihbench.render.zbuffer import NEAR, rasterize, vertex_normals
+from ihbench.scene.regions import projected_box
 from ihbench.stress.case import Answer, Case, Unit, words_of
 
 ROTATION = "entries are at most 1 and take about 4 roundings; the angle's own rounding counts |angle| times"

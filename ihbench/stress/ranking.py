@@ -88,8 +88,8 @@ def means(frames: Sequence[Frame], preset: Preset, region: str, metric: str, bac
 @cache
 def field(background: Color = WHITE) -> tuple[Frame, ...]:
     """Four test views of a person half hidden in training, on a background, and all contestants."""
+    from ihbench.scene.views import open_scene
     from ihbench.scoring import Scorer
-    from ihbench.views import open_scene
 
     capture = turning_capture(6)
     protocol = small_protocol(n_frames=6, size=SIZE)

@@ -27,9 +27,9 @@ from ihbench.methods.inpainthuman.stage3 import Stage3
 from ihbench.metrics import mean_over_frames
 from ihbench.reopen import reopen_scene
 from ihbench.results import read_result
-from ihbench.scene import MaskState, TrainingSet, TrainView
+from ihbench.scene.contracts import MaskState, TrainingSet, TrainView
+from ihbench.scene.views import OccludedScene, uncovered
 from ihbench.scoring import Scorer
-from ihbench.views import OccludedScene, uncovered
 
 STATES = (Stage1.name, PAINTED_STATE)
 

@@ -15,7 +15,7 @@ from ihbench.errors import BadInput
 from ihbench.methods.inpainthuman.inpainting.inpaint_config import PAPER_INPAINT, QUICK_INPAINT, InpaintConfig
 from ihbench.methods.inpainthuman.refine_config import PAPER_REFINE, QUICK_REFINE, RefineConfig
 from ihbench.metrics.weights import FILES, locate
-from ihbench.plan import Omission, SceneMeasure
+from ihbench.scene.plan import Omission, SceneMeasure
 
 WEIGHT, RATE = Within(0, 1e6), Within(0, 1000)  # of a term of the loss; a step size
 STATIC_DEG = 5.0  # below this joint motion nothing depends on the pose
@@ -145,7 +145,7 @@ SHARED_STATES = {"stage1": ("inpaint.", "refine.")}  # saved state -> beginnings
 
 
 def leave_out(config: InpaintHumanConfig, scene: SceneMeasure) -> list[Omission]:
-    """What this scene does not need of this configuration (see `ihbench.plan`)."""
+    """What this scene does not need of this configuration (see `ihbench.scene.plan`)."""
     found = []
     if config.pose_residual and scene.motion_deg < STATIC_DEG:
         reason = f"no joint turns more than {scene.motion_deg:.1f}° over the training frames (limit {STATIC_DEG}°)"

@@ -13,7 +13,7 @@ from ihbench.errors import BadInput
 from ihbench.methods.inpainthuman.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.config import InpaintHumanConfig
 from ihbench.methods.inpainthuman.stage1 import Stage1
-from ihbench.scene import TrainingSet
+from ihbench.scene.contracts import TrainingSet
 
 
 class InpaintHuman:
@@ -25,7 +25,7 @@ class InpaintHuman:
     def fit(
         self, training: TrainingSet, *, device: str, seed: int, ledger: Ledger, progress: Progress
     ) -> GaussianAvatar:
-        """Fit one person. See `ihbench.scene.Method`. Raises `BadInput` without a view that shows the person."""
+        """Fit one person. See `ihbench.scene.contracts.Method`. Raises `BadInput` without a view that shows the person."""
         if not len(training.views):
             raise BadInput(f"scene {training.name}: no training view; nothing to fit")
         inpaint = self.config.inpaint

@@ -24,7 +24,7 @@ from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput, Diverged
 from ihbench.methods.inpainthuman.avatar import GaussianAvatar
-from ihbench.scene import MaskState, TrainingSet
+from ihbench.scene.contracts import MaskState, TrainingSet
 
 GOOD_EVERY = 25  # steps between two copies to go back to
 SMALLER = 0.1  # share that is left of the step sizes after going back

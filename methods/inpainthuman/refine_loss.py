@@ -18,7 +18,7 @@ from torch import Tensor
 from ihbench.methods.inpainthuman.dissimilarity import dissimilarity, where_known
 from ihbench.methods.inpainthuman.inpainting.painted_view import PaintedView
 from ihbench.methods.inpainthuman.refine_config import RefineConfig
-from ihbench.scene import MaskState
+from ihbench.scene.contracts import MaskState
 
 Perceptual = Callable[[Tensor, Tensor], Tensor]  # two images [h, w, 3] in [0, 1] -> a distance
 

@@ -15,8 +15,8 @@ from ihbench.methods.inpainthuman.config import ONE_FIT_SSIM
 from ihbench.methods.inpainthuman.dissimilarity import dissimilarity, where_known
 from ihbench.methods.inpainthuman.optimisation import Optimisation
 from ihbench.render.splat import render_gaussians
-from ihbench.scene import MaskState, TrainingSet, TrainView
-from ihbench.views import LazyViews
+from ihbench.scene.contracts import MaskState, TrainingSet, TrainView
+from ihbench.scene.views import LazyViews
 
 MARGIN = 0.15  # of the projected body's box on every side: garments and pose errors stay inside the window
 STATE = "stage1"

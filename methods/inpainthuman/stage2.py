@@ -15,7 +15,7 @@ from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
 from ihbench.methods.inpainthuman.inpainting.painted_view import PaintedView, paste_back
 from ihbench.methods.inpainthuman.inpainting.shown_view import turntable_view, with_known_surface
 from ihbench.methods.inpainthuman.inpainting.surface_need import SeenSurface, key_views, seen_surface
-from ihbench.scene import MaskState, TrainingSet, TrainView
+from ihbench.scene.contracts import MaskState, TrainingSet, TrainView
 
 STATE = "stage2-painted"
 TEXELS = 128  # side of the UV grid on which the need is measured

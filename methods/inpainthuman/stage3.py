@@ -30,8 +30,8 @@ from ihbench.methods.inpainthuman.stage1 import (
     initial_loss,
     prepare_target,
 )
-from ihbench.scene import MaskState, TrainingSet, TrainView
-from ihbench.views import LazyViews
+from ihbench.scene.contracts import MaskState, TrainingSet, TrainView
+from ihbench.scene.views import LazyViews
 
 STATE = "stage3"
 

@@ -23,7 +23,7 @@ from ihbench.methods.inpainthuman.config import QUICK, InpaintHumanConfig
 from ihbench.methods.inpainthuman.method import InpaintHuman
 from ihbench.methods.inpainthuman.optimisation import MOST_ROLL_BACKS
 from ihbench.methods.inpainthuman.stage1 import Stage1, loss_of, prepare_target
-from ihbench.scene import MaskState, TrainingSet, TrainView
+from ihbench.scene.contracts import MaskState, TrainingSet, TrainView
 from ihbench.stress.case import Answer, Case, Unit, words_of
 from ihbench.stress.drawn_capture import WHITE, a_camera, a_pose, the_body, train_view
 from ihbench.stress.training import told

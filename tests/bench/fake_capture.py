@@ -6,7 +6,7 @@ import numpy as np
 
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
-from ihbench.scene import MaskState, TestView
+from ihbench.scene.contracts import MaskState, TestView
 from ihbench.stress.drawn_capture import (
     DISTANCE,
     FOCAL,

@@ -20,14 +20,14 @@ from ihbench.clock.progress import Progress
 from ihbench.commands import ablate as ablate_command
 from ihbench.commands.ablate import AblateOptions
 from ihbench.config_fields import flat
-from ihbench.data_source import DataSource
 from ihbench.errors import BadInput
 from ihbench.files.atomic import read_json
 from ihbench.methods.inpainthuman.config import LEAST_TEXELS, PROFILES, QUICK
-from ihbench.plan import SceneMeasure
-from ihbench.protocol import load_protocol
 from ihbench.results import read_result
 from ihbench.run_loop import RunRequest, _planned
+from ihbench.scene.data_source import DataSource
+from ihbench.scene.plan import SceneMeasure
+from ihbench.scene.protocol import load_protocol
 from ihbench.shared_states import lend, lender
 from ihbench.store import RunFolder
 from tests.conftest import SCENES

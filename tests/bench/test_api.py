@@ -10,11 +10,11 @@ import pytest
 
 import ihbench
 from ihbench.clock.progress import Progress
-from ihbench.data_source import locate
 from ihbench.errors import BadInput
 from ihbench.files.atomic import read_json
-from ihbench.protocol import load_protocol
 from ihbench.run_loop import RunRequest
+from ihbench.scene.data_source import locate
+from ihbench.scene.protocol import load_protocol
 
 QUIET = Progress.silent()
 

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ihbench import data_source
 from ihbench.clock.ledger import Ledger
 from ihbench.files import locks
 from ihbench.files.atomic import read_json
 from ihbench.results import read_result
+from ihbench.scene import data_source
 from ihbench.store import RunFolder
 from tests.conftest import contents, tiny_protocol
 
@@ -379,7 +379,7 @@ def test_a_protocol_file_with_frames_beyond_the_capture_makes_no_folder(bench, m
 
 
 def test_a_rule_that_does_not_fit_the_data_makes_no_folder(bench, mannequin, monkeypatch):
-    from ihbench import occlusion
+    from ihbench.scene import occlusion
 
     def wrong(request):
         raise occlusion.BadInput("the strip is wider than the image")

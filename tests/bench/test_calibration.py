@@ -8,7 +8,7 @@ import pytest
 from ihbench.body import texel_table
 from ihbench.calibration import DESCRIPTIONS, ROWS, Calibration
 from ihbench.metrics import psnr
-from ihbench.scene import MaskState
+from ihbench.scene.contracts import MaskState
 
 from .fake_capture import SIZE, WHITE, a_camera, a_pose, rasterized, the_body, train_view, truth_view
 

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from ihbench.calibration import Calibration
 from ihbench.curve_views import curve_views, representatives
 from ihbench.metrics import mean_over_frames
-from ihbench.protocol import Span, TestGroup
+from ihbench.scene.protocol import Span, TestGroup
+from ihbench.scene.views import open_scene
 from ihbench.scoring import Scorer
-from ihbench.views import open_scene
 
 from .fake_capture import a_camera, fake_protocol, the_body, turning_capture
 

@@ -10,13 +10,13 @@ import pytest
 from ihbench.body import load_body
 from ihbench.cli import main
 from ihbench.clock.progress import Progress
-from ihbench.data_source import body_file, locate
 from ihbench.datasets import plain_scene
 from ihbench.errors import BadInput
 from ihbench.files.images import write_png
-from ihbench.protocol import load_protocol
 from ihbench.results import read_result
-from ihbench.views import open_scene
+from ihbench.scene.data_source import body_file, locate
+from ihbench.scene.protocol import load_protocol
+from ihbench.scene.views import open_scene
 from tests.bench.fake_capture import a_camera, a_pose, photograph
 
 

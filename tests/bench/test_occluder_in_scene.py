@@ -13,11 +13,11 @@ from ihbench.camera import distort
 from ihbench.datasets import plain_scene
 from ihbench.errors import BadInput
 from ihbench.metrics.identity import METRICS
-from ihbench.occlusion import Occlusion, occluder
-from ihbench.protocol import load_protocol, protocol_from, read_protocol
-from ihbench.scene import MaskState
+from ihbench.scene.contracts import MaskState
+from ihbench.scene.occlusion import Occlusion, occluder
+from ihbench.scene.protocol import load_protocol, protocol_from, read_protocol
+from ihbench.scene.views import open_scene, uncovered
 from ihbench.scoring import Scorer
-from ihbench.views import open_scene, uncovered
 
 from .fake_capture import DISTORTION, fake_protocol, rasterized, the_body, turning_capture
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ihbench import plan
 from ihbench.body import texel_table
 from ihbench.body.pose import BodyPose
 from ihbench.config_fields import flat, with_fields
@@ -22,16 +21,17 @@ from ihbench.methods.inpainthuman.config import (
     RESIDUAL_SHARE,
     leave_out,
 )
-from ihbench.plan import (
+from ihbench.scene import plan
+from ihbench.scene.plan import (
     TEXELS,
     Omission,
     SceneMeasure,
     absent_regions,
     measure_scene,
 )
-from ihbench.protocol import REGIONS
-from ihbench.views import open_scene
-from ihbench.visibility import texel_visibility
+from ihbench.scene.protocol import REGIONS
+from ihbench.scene.views import open_scene
+from ihbench.scene.visibility import texel_visibility
 from tests.reports.fake_runs import identity
 
 from .fake_capture import DISTANCE, DISTORTION, FOCAL, SIZE, FakeCapture, a_camera, a_pose, fake_protocol, the_body

@@ -11,8 +11,8 @@ import pytest
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.prepare import prepare
-from ihbench.scene import MaskState
-from ihbench.views import open_scene
+from ihbench.scene.contracts import MaskState
+from ihbench.scene.views import open_scene
 from tests.bench.fake_capture import fake_protocol, the_body, turning_capture
 
 LAYOUTS = ["zju", "zju-refine", "humannerf", "instantavatar", "gaussianavatar", "ocmotion-w2a"]

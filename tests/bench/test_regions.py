@@ -8,9 +8,9 @@ from scipy.spatial import ConvexHull
 
 from ihbench.body import texel_table
 from ihbench.camera import look_at
-from ihbench.protocol import REGIONS
-from ihbench.regions import SurfaceMap, projected_box
-from ihbench.visibility import Visibility, texel_visibility
+from ihbench.scene.protocol import REGIONS
+from ihbench.scene.regions import SurfaceMap, projected_box
+from ihbench.scene.visibility import Visibility, texel_visibility
 
 from .fake_capture import SIZE, a_camera, a_pose, rasterized, the_body, train_view, truth_view
 

@@ -18,8 +18,8 @@ from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.files import locks, removal
 from ihbench.prepare import prepare
+from ihbench.scene.views import open_scene
 from ihbench.store import RunFolder
-from ihbench.views import open_scene
 from tests.bench.fake_capture import fake_protocol, the_body, turning_capture
 from tests.bench.test_store import IDENTITY
 from tests.conftest import contents
@@ -190,7 +190,7 @@ def test_what_killed_calls_left_goes_and_what_looks_like_it_stays(scene, tmp_pat
 def test_the_command_does_not_touch_the_data(bench, tmp_path):
     """The fault as it was found: the data's own folder as --out."""
     with bench.in_its_world():
-        from ihbench.data_source import standin_root
+        from ihbench.scene.data_source import standin_root
 
         data = standin_root("zju_mocap")
     before = {path: path.stat().st_mtime_ns for path in data.rglob("*")}

@@ -11,15 +11,15 @@ import ihbench
 from ihbench import registry
 from ihbench.calibration import ROWS, Calibration
 from ihbench.clock.progress import Progress
-from ihbench.data_source import locate
 from ihbench.files import atomic
 from ihbench.files.atomic import read_json, read_json_lines
 from ihbench.methods.inpainthuman.config import QUICK
 from ihbench.metrics import psnr
-from ihbench.protocol import load_protocol
 from ihbench.results import read_result
-from ihbench.scene import MaskState
-from ihbench.views import open_scene
+from ihbench.scene.contracts import MaskState
+from ihbench.scene.data_source import locate
+from ihbench.scene.protocol import load_protocol
+from ihbench.scene.views import open_scene
 from tests.conftest import contents
 
 SWITCHES = {

@@ -10,10 +10,10 @@ import torch
 
 from ihbench import scoring
 from ihbench.errors import BadInput
-from ihbench.protocol import REGIONS
+from ihbench.scene.protocol import REGIONS
+from ihbench.scene.views import open_scene
+from ihbench.scene.visibility import texel_visibility
 from ihbench.scoring import Scorer
-from ihbench.views import open_scene
-from ihbench.visibility import texel_visibility
 
 from .fake_capture import fake_protocol, the_body, turning_capture
 

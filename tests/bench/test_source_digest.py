@@ -17,7 +17,7 @@ from ihbench.calibration import Calibration
 from ihbench.clock.ledger import Ledger
 from ihbench.errors import BadInput
 from ihbench.files import atomic
-from ihbench.protocol import load_protocol
+from ihbench.scene.protocol import load_protocol
 from ihbench.shared_states import lender
 from ihbench.source_digest import bench_code, code_of, tree_digest
 from ihbench.store import RunFolder, identity_digest
@@ -44,12 +44,17 @@ HARMLESS = {
 OF_THE_BENCH = [
     *("ihbench/render/splat.py", "ihbench/render/splat_numba.py", "ihbench/render/zbuffer.py"),
     *("ihbench/body/uv.py", "ihbench/body/skinning_numpy.py", "ihbench/body/smpl_file.py"),
-    *("ihbench/views.py", "ihbench/occlusion.py", "ihbench/regions.py", "ihbench/visibility.py"),
+    *(
+        "ihbench/scene/views.py",
+        "ihbench/scene/occlusion.py",
+        "ihbench/scene/regions.py",
+        "ihbench/scene/visibility.py",
+    ),
     *("ihbench/metrics/ssim.py", "ihbench/metrics/flip_numba.py", "ihbench/metrics/presets.py"),
     *("ihbench/scoring.py", "ihbench/score_stage.py", "ihbench/calibration.py", "ihbench/predictions.py"),
     *(
-        "ihbench/plan.py",
-        "ihbench/protocol.py",
+        "ihbench/scene/plan.py",
+        "ihbench/scene/protocol.py",
         "ihbench/camera.py",
         "ihbench/run_loop.py",
         "ihbench/clock/ledger.py",

@@ -11,9 +11,9 @@ import pytest
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera, distort
 from ihbench.errors import BadInput
-from ihbench.protocol import Span, load_protocol
-from ihbench.scene import MaskState
-from ihbench.views import LazyViews, TestViewKey, Undistorter, open_scene
+from ihbench.scene.contracts import MaskState
+from ihbench.scene.protocol import Span, load_protocol
+from ihbench.scene.views import LazyViews, TestViewKey, Undistorter, open_scene
 
 from .fake_capture import DISTORTION, SIZE, FakeCapture, a_camera, fake_protocol, rasterized, turning_capture
 

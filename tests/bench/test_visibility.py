@@ -8,8 +8,8 @@ import pytest
 from ihbench.body import JOINT_INDEX, texel_table
 from ihbench.body.pose import BodyPose
 from ihbench.camera import look_at
-from ihbench.scene import MaskState
-from ihbench.visibility import FACING, surface_texels, texel_visibility
+from ihbench.scene.contracts import MaskState
+from ihbench.scene.visibility import FACING, surface_texels, texel_visibility
 
 from .fake_capture import DISTORTION, SIZE, a_camera, a_pose, the_body, train_view
 

@@ -20,12 +20,12 @@ from ihbench.body.pose import BodyPose
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera, look_at
 from ihbench.commands import data
-from ihbench.data_source import open_dataset
 from ihbench.datasets import plain_scene
 from ihbench.datasets.plain_scene import PlainScene, read_cameras, read_poses
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.render.zbuffer import rasterize
+from ihbench.scene.data_source import open_dataset
 
 WIDTH, HEIGHT = 64, 48
 FRAMES = [3, 4, 10]

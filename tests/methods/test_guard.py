@@ -14,7 +14,7 @@ from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import Diverged
 from ihbench.methods.inpainthuman.optimisation import GOOD_EVERY, MOST_ROLL_BACKS, SMALLER
 from ihbench.methods.inpainthuman.stage1 import Stage1, loss_of, prepare_target
-from ihbench.scene import MaskState
+from ihbench.scene.contracts import MaskState
 
 from .tiny_fit import an_avatar, equal_bits, fitted, parameters_of, training_set, training_views
 

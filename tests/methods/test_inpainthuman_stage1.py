@@ -16,7 +16,7 @@ from ihbench.methods.inpainthuman.method import InpaintHuman
 from ihbench.methods.inpainthuman.stage1 import Stage1, body_window, loss_of, prepare_target
 from ihbench.metrics import psnr
 from ihbench.render.splat import render_gaussians
-from ihbench.scene import MaskState, TrainingSet
+from ihbench.scene.contracts import MaskState, TrainingSet
 from tests.bench.fake_capture import WHITE, a_camera, a_pose, the_body, train_view
 
 from .tiny_fit import SIZE, TINY, an_avatar, equal_bits, fitted, parameters_of, shaken, training_set, training_views

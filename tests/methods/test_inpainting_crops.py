@@ -24,7 +24,7 @@ from ihbench.methods.inpainthuman.inpainting.part_map import (
 from ihbench.methods.inpainthuman.inpainting.person_crop import PersonCrop, person_crop
 from ihbench.methods.inpainthuman.inpainting.push_pull import push_pull
 from ihbench.methods.inpainthuman.inpainting.random_mask import KINDS, random_mask
-from ihbench.scene import MaskState, TrainView
+from ihbench.scene.contracts import MaskState, TrainView
 
 STANDING = BodyPose(np.zeros((24, 3)), np.zeros(10), np.zeros(3))
 

@@ -18,8 +18,8 @@ from ihbench.methods.inpainthuman.inpainting.painted_view import paste_back
 from ihbench.methods.inpainthuman.inpainting.shown_view import orbit, turntable_view, with_known_surface
 from ihbench.methods.inpainthuman.inpainting.surface_need import SeenSurface, key_views, pixels_of, seen_surface
 from ihbench.methods.inpainthuman.stage2 import Stage2
-from ihbench.scene import MaskState
-from ihbench.visibility import surface_texels
+from ihbench.scene.contracts import MaskState
+from ihbench.scene.visibility import surface_texels
 from tests.bench.fake_capture import a_camera, a_pose, the_body, train_view
 from tests.methods.tiny_fit import SIZE, an_avatar, shaken, training_set, training_views
 

@@ -21,7 +21,7 @@ from ihbench.methods.inpainthuman.stage3 import Stage3
 from ihbench.metrics import psnr, ssim
 from ihbench.metrics.lpips import lpips, random_networks
 from ihbench.metrics.ssim import ssim_map
-from ihbench.scene import MaskState, TrainView
+from ihbench.scene.contracts import MaskState, TrainView
 from tests.bench.fake_capture import WHITE, a_camera, a_pose, train_view
 
 from .tiny_fit import SIZE, STRIP, an_avatar, equal_bits, fitted, parameters_of, shaken, training_set, training_views

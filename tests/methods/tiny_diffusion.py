@@ -10,7 +10,7 @@ import torch
 from ihbench.methods.inpainthuman.inpainting import mini_model
 from ihbench.methods.inpainthuman.inpainting.backbone import Backbone
 from ihbench.methods.inpainthuman.inpainting.crop_view import CropView, cut_view
-from ihbench.scene import MaskState, TrainView
+from ihbench.scene.contracts import MaskState, TrainView
 from tests.bench.fake_capture import the_body
 from tests.methods.tiny_fit import training_views
 

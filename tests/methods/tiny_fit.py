@@ -14,7 +14,7 @@ from ihbench.clock.progress import Progress
 from ihbench.methods.inpainthuman.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.config import QUICK
 from ihbench.methods.inpainthuman.stage1 import Stage1
-from ihbench.scene import TrainingSet, TrainView
+from ihbench.scene.contracts import TrainingSet, TrainView
 from tests.bench.fake_capture import WHITE, a_camera, a_pose, the_body, train_view
 
 SIZE = 64  # px

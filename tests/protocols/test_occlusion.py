@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from ihbench.errors import BadInput
-from ihbench.occlusion import OcclusionRequest
-from ihbench.protocol import load_protocol
 from ihbench.protocols import occlusion
 from ihbench.protocols.occlusion import fixed_strip, none, strip_generic
+from ihbench.scene.occlusion import OcclusionRequest
+from ihbench.scene.protocol import load_protocol
 
 
 def request(subject="377", width=1024, silhouettes=None, covered=None, protocol="zju_occ", **changed):

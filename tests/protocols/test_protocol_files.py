@@ -4,7 +4,7 @@ import pytest
 
 from ihbench import registry
 from ihbench.errors import BadInput
-from ihbench.protocol import difference, load_protocol, read_protocol
+from ihbench.scene.protocol import difference, load_protocol, read_protocol
 
 RAW = 10_000  # more frames than any subject has: the protocol's own limits rule
 

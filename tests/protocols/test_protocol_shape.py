@@ -8,8 +8,8 @@ import pytest
 
 from ihbench import registry
 from ihbench.errors import BadInput
-from ihbench.protocol import PROFILES, load_protocol, read_protocol
-from ihbench.protocol_shape import check_protocol
+from ihbench.scene.protocol import PROFILES, load_protocol, read_protocol
+from ihbench.scene.protocol_shape import check_protocol
 
 
 @pytest.fixture

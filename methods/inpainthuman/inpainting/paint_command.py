@@ -58,10 +58,10 @@ def main(argv: list[str]) -> int:
 def _paint(chosen: Any) -> int:
     from ihbench import outputs, registry
     from ihbench.clock.progress import Progress
-    from ihbench.data_source import locate
     from ihbench.methods.inpainthuman.inpainting.grid import png
     from ihbench.methods.inpainthuman.inpainting.paint_table import paint_scene, summary, table
-    from ihbench.protocol import load_protocol
+    from ihbench.scene.data_source import locate
+    from ihbench.scene.protocol import load_protocol
 
     check_device(chosen.device)
     for row in chosen.rows:

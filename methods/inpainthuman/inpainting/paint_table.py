@@ -18,9 +18,9 @@ from ihbench.methods.inpainthuman.inpainting.crop_view import CropView, cut_view
 from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
 from ihbench.methods.inpainthuman.inpainting.paint_rows import DIFFUSION, FILLS, FULL
 from ihbench.metrics.statistics import mean_interval, paired_test
-from ihbench.protocol import Protocol
-from ihbench.scene import Capture
-from ihbench.views import open_scene, uncovered
+from ihbench.scene.contracts import Capture
+from ihbench.scene.protocol import Protocol
+from ihbench.scene.views import open_scene, uncovered
 
 SIZES = {"mini": (128, False), "sd2": (512, True)}  # px, height of all painters' crops, and whether they are square
 SCORES = ("psnr", "ssim", "flip")

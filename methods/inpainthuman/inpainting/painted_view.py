@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
-from ihbench.scene import MaskState, TrainView
+from ihbench.scene.contracts import MaskState, TrainView
 
 
 @dataclass(frozen=True)

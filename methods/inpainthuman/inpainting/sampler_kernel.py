@@ -20,7 +20,7 @@ from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
 from ihbench.methods.inpainthuman.inpainting.mini_weights import load_mini
 from ihbench.methods.inpainthuman.inpainting.sampling import sample
 from ihbench.methods.inpainthuman.inpainting.subject_token import ANYBODY
-from ihbench.scene import MaskState, TrainView
+from ihbench.scene.contracts import MaskState, TrainView
 
 STEPS = (1, 2, 3, 6, 12)
 MANY = 50  # steps, in float64: what few steps are held against

@@ -12,7 +12,7 @@ from ihbench.body import Body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.methods.inpainthuman.inpainting.surface_need import SeenSurface, pixels_of
-from ihbench.scene import MaskState, TrainingSet, TrainView
+from ihbench.scene.contracts import MaskState, TrainingSet, TrainView
 
 Background = tuple[float, float, float]
 

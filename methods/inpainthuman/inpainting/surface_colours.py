@@ -14,8 +14,8 @@ from ihbench.body import Body
 from ihbench.body.uv import Texels, map_coordinates, texel_table
 from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
 from ihbench.render.zbuffer import rasterize
-from ihbench.scene import MaskState, TrainView
-from ihbench.visibility import surface_texels
+from ihbench.scene.contracts import MaskState, TrainView
+from ihbench.scene.visibility import surface_texels
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class FacedTexels:
 
 
 def faced_texels(view: CropView, body: Body, texels: Texels) -> FacedTexels:
-    """`ihbench.visibility`'s rules for what is the nearest surface, at the crop's size."""
+    """`ihbench.scene.visibility`'s rules for what is the nearest surface, at the crop's size."""
     vertices = body.pose(view.body_pose)
     nearest, *_ = surface_texels(vertices, body, texels, _train_view(view))
     corners = vertices[body.faces[texels.face[nearest]]]

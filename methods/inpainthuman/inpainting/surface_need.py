@@ -18,8 +18,8 @@ from ihbench.body import Body
 from ihbench.body.uv import Texels, texel_table
 from ihbench.camera import Camera
 from ihbench.render.zbuffer import rasterize
-from ihbench.scene import MaskState, TrainingSet
-from ihbench.visibility import surface_texels
+from ihbench.scene.contracts import MaskState, TrainingSet
+from ihbench.scene.visibility import surface_texels
 
 BAND = 0.05  # of the body's height in the image: garments and hair reach no farther off the body
 ENOUGH = 3  # views that should paint a texel

@@ -43,7 +43,6 @@ def main(argv: list[str]) -> int:
 
 def _train(chosen: Any) -> dict[str, Any]:
     from ihbench.clock.progress import Progress
-    from ihbench.data_source import cache_folder
     from ihbench.files import removal
     from ihbench.files.locks import locked
     from ihbench.methods.inpainthuman.inpainting.mini_card import write_card
@@ -51,6 +50,7 @@ def _train(chosen: Any) -> dict[str, Any]:
     from ihbench.methods.inpainthuman.inpainting.mini_validation import validate
     from ihbench.methods.inpainthuman.inpainting.mini_weights import save_mini
     from ihbench.methods.inpainthuman.inpainting.train_mini import MiniTrainer
+    from ihbench.scene.data_source import cache_folder
 
     check_device(chosen.device)
     if chosen.out.resolve() == SHIPPED.resolve():

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from ihbench.plan import Omission
+from ihbench.scene.plan import Omission
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.render.zbuffer import rasterize
-from ihbench.scene import MaskState
+from ihbench.scene.contracts import MaskState
 
 if TYPE_CHECKING:
     from ihbench.body import Body

@@ -20,9 +20,9 @@ from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.errors import BadInput
 from ihbench.metrics.images import bounds
-from ihbench.occlusion import OcclusionPlan, apply_rule, grown_for_clothes
-from ihbench.protocol import ImageRule, Protocol
-from ihbench.scene import Capture, MaskState, TestView, TrainView
+from ihbench.scene.contracts import Capture, MaskState, TestView, TrainView
+from ihbench.scene.occlusion import OcclusionPlan, apply_rule, grown_for_clothes
+from ihbench.scene.protocol import ImageRule, Protocol
 
 if TYPE_CHECKING:
     from ihbench.body import Body
@@ -233,8 +233,8 @@ class Undistorter:
         """[h, w] pixels that no photograph shows although the body may be there; None for none."""
         if self.unphotographed is None:
             return None
-        from ihbench.regions import projected_box
         from ihbench.render.zbuffer import rasterize
+        from ihbench.scene.regions import projected_box
 
         camera = self.camera
         if not (self.unphotographed & projected_box(body.posed_joints(body_pose), camera, REACH)).any():

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ihbench.errors import BadInput
 from ihbench.files.paths import user_path
-from ihbench.scene import Dataset
+from ihbench.scene.contracts import Dataset
 
 if TYPE_CHECKING:
     from ihbench.body import Body
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class LayoutChoice:
-    """A registered data set: called with a folder it opens the layout that is there; see `ihbench.scene.Dataset`."""
+    """A registered data set: called with a folder it opens the layout that is there; see `ihbench.scene.contracts.Dataset`."""
 
     name: str
     layouts: tuple[str, ...]  # "module:class" of each, in the order in which they are tried

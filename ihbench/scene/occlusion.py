@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from ihbench import registry
 from ihbench.errors import BadInput
-from ihbench.protocol import OcclusionRule, Protocol
-from ihbench.scene import Capture
+from ihbench.scene.contracts import Capture
+from ihbench.scene.protocol import OcclusionRule, Protocol
 
 Mask = NDArray[np.bool_]
 

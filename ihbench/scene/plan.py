@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from ihbench.body.pose import BodyPose
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera
-from ihbench.occlusion import OcclusionPlan, apply_rule, withheld
-from ihbench.protocol import Protocol
-from ihbench.scene import Capture, MaskState
-from ihbench.visibility import Visibility, texel_visibility
+from ihbench.scene.contracts import Capture, MaskState
+from ihbench.scene.occlusion import OcclusionPlan, apply_rule, withheld
+from ihbench.scene.protocol import Protocol
+from ihbench.scene.visibility import Visibility, texel_visibility
 
 if TYPE_CHECKING:
     from ihbench.body import Body

@@ -14,11 +14,11 @@ from ihbench.bounds import LARGEST_CAST, refuse_repeated
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.files.paths import cache_folder, path_from, user_path
-from ihbench.protocol import Protocol
-from ihbench.scene import Capture, Dataset
+from ihbench.scene.contracts import Capture, Dataset
+from ihbench.scene.protocol import Protocol
 
 if TYPE_CHECKING:
-    from ihbench.views import TestViewKey
+    from ihbench.scene.views import TestViewKey
 
 STANDIN_SEED = 0
 NEARBY = 200  # folders that are looked into for data that were not where they were said to be
@@ -61,7 +61,7 @@ class DataSource:
 
     def test_keys(self, scene: str) -> tuple[TestViewKey, ...]:
         """The test views of a scene. No image is read, and none made of a stand-in. Raises `BadInput` as `open`."""
-        from ihbench.views import test_view_keys
+        from ihbench.scene.views import test_view_keys
 
         if self.is_standin:
             standin = registry.load("stand-in", self.protocol.dataset)

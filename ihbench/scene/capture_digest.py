@@ -6,8 +6,8 @@ import hashlib
 
 import numpy as np
 
-from ihbench.protocol import Protocol
-from ihbench.scene import Capture
+from ihbench.scene.contracts import Capture
+from ihbench.scene.protocol import Protocol
 
 
 def capture_digest(capture: Capture, protocol: Protocol) -> str:

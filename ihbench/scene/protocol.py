@@ -17,7 +17,7 @@ from ihbench import registry
 from ihbench.bounds import whole
 from ihbench.errors import BadInput
 from ihbench.files.regular import read_toml
-from ihbench.protocol_shape import check_protocol
+from ihbench.scene.protocol_shape import check_protocol
 
 REGIONS = ("full", "box", "body", "visible", "hidden", "never_seen")
 PROFILES = ("paper", "quick")  # every protocol has both
@@ -321,7 +321,7 @@ def _one_of(value: str, known: tuple[str, ...], what: str) -> str:
 
 
 def _trait(rule: str, name: str, default: bool) -> bool:
-    """What a registered occlusion rule says of itself; see `ihbench.occlusion.occluder`."""
+    """What a registered occlusion rule says of itself; see `ihbench.scene.occlusion.occluder`."""
     return bool(getattr(registry.load("occlusion", rule), name, default))
 
 

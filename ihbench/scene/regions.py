@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from ihbench.camera import Camera
 from ihbench.metrics.images import bounds
 from ihbench.render.zbuffer import NEAR, rasterize
-from ihbench.scene import TestView
-from ihbench.visibility import Visibility
+from ihbench.scene.contracts import TestView
+from ihbench.scene.visibility import Visibility
 
 if TYPE_CHECKING:
     from ihbench.body import Body

@@ -1,0 +1,1 @@
+"""What a run is about: contracts, protocol, occlusion, views, what they show of the surface, regions, plan."""
