@@ -19,8 +19,8 @@ from ihbench.metrics.evaluate import Preset, find_preset
 from ihbench.record import preset_lines
 from ihbench.reopen import reopen_protocol, reopen_scene
 from ihbench.results import view_rows
+from ihbench.score.scoring import LoadedView, Scorer, ViewScores
 from ihbench.score_stage import ScoreStage, render_path
-from ihbench.scoring import LoadedView, Scorer, ViewScores
 from ihbench.source_digest import bench_code
 from ihbench.store import RunFolder
 

@@ -6,12 +6,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from ihbench.calibration import ROWS
 from ihbench.errors import BadInput
 from ihbench.metrics import Identity
 from ihbench.registry import nearest
 from ihbench.results import RunResult
 from ihbench.row_labels import by_configuration
+from ihbench.score.calibration import ROWS
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,6 @@ from ihbench.bounds import SEEDS
 from ihbench.clock import machine
 from ihbench.clock.progress import Progress
 from ihbench.config_fields import flat, with_fields
-from ihbench.curve_views import curve_views
 from ihbench.errors import BadInput
 from ihbench.metrics import mean_over_frames
 from ihbench.provenance import command
@@ -36,8 +35,9 @@ from ihbench.scene.data_source import DataSource
 from ihbench.scene.plan import Omission, SceneMeasure, absent_regions, measure_scene
 from ihbench.scene.protocol import Protocol
 from ihbench.scene.views import OccludedScene, open_scene
+from ihbench.score.curve_views import curve_views
+from ihbench.score.scoring import Scorer
 from ihbench.score_stage import ScoreStage
-from ihbench.scoring import Scorer
 from ihbench.source_digest import code_of, shipped_digest
 from ihbench.store import RunFolder, RunIdentity, is_finished
 

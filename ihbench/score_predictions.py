@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ihbench.clock.progress import Progress
-from ihbench.prediction_doubts import Doubts
-from ihbench.predictions import Predictions, find_alpha, find_predictions
 from ihbench.prepared import Prepared
 from ihbench.provenance import command
 from ihbench.recorded_run import RecordedRun, about_scene, recorded
@@ -17,8 +15,10 @@ from ihbench.scene.capture_digest import capture_digest
 from ihbench.scene.data_source import DataSource
 from ihbench.scene.protocol import Protocol
 from ihbench.scene.views import OccludedScene, open_scene
+from ihbench.score.prediction_doubts import Doubts
+from ihbench.score.predictions import Predictions, find_alpha, find_predictions
+from ihbench.score.scoring import Scorer
 from ihbench.score_stage import ScoreStage
-from ihbench.scoring import Scorer
 from ihbench.source_digest import bench_code
 from ihbench.store import RunFolder, RunIdentity
 from ihbench.version import __version__
@@ -40,7 +40,7 @@ class ScoreRequest:
     runs: Path = Path("runs")
     body: Path | None = None  # SMPL model file, for real data
     force: bool = False
-    alpha: str | None = None  # what the colours of transparent pixels are, see `ihbench.predictions`
+    alpha: str | None = None  # what the colours of transparent pixels are, see `ihbench.score.predictions`
     prepared: Prepared | None = None  # what was handed out to the code that drew the images
 
 

@@ -11,9 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench.calibration import ROWS, Calibration
 from ihbench.clock.progress import Progress
-from ihbench.contact_sheet import SheetRow, contact_sheet
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.images import write_png
@@ -21,7 +19,9 @@ from ihbench.metrics.eight_bit import rounded
 from ihbench.record import score_lines
 from ihbench.results import group_row, view_rows
 from ihbench.scene.views import OccludedScene
-from ihbench.scoring import LoadedView, Predictor, Scorer
+from ihbench.score.calibration import ROWS, Calibration
+from ihbench.score.contact_sheet import SheetRow, contact_sheet
+from ihbench.score.scoring import LoadedView, Predictor, Scorer
 from ihbench.source_digest import bench_code
 from ihbench.store import RunFolder
 

@@ -35,7 +35,7 @@ NOT_IN_NUMBERS = (
     *(f"{room}/*" for room in registry.ROOMS),
     "commands/*", "kernels/*", "stress/*", "__main__.py", "cli.py", "clock/progress.py", "errors.py", "registry.py",
     "ablation.py", "cells.py", "earlier_runs.py", "index.py", "quality_time.py",
-    "contact_sheet.py", "document/*", "files/splat_ply.py", "row_choice.py", "row_labels.py",
+    "score/contact_sheet.py", "document/*", "files/splat_ply.py", "row_choice.py", "row_labels.py",
     "api.py", "repeat.py", "clock/gpu_slots.py", "clock/failures.py", "clock/streams.py",
     "clock/machine.py", "provenance.py", "clock/threads.py",
     "metrics/oracles/*",

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from ihbench.calibration import DESCRIPTIONS, ROWS
 from ihbench.errors import BadInput
 from ihbench.metrics import Identity, Mean, macro_mean
 from ihbench.metrics.identity import metric_of
@@ -31,6 +30,7 @@ from ihbench.reports.run_time import across_sizes_section, run_time_section
 from ihbench.reports.significance import intervals_section
 from ihbench.results import RunResult
 from ihbench.row_labels import by_label
+from ihbench.score.calibration import DESCRIPTIONS, ROWS
 
 Rows = dict[str, dict[str, Mean]]  # of one run: row -> identity -> mean
 

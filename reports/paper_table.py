@@ -12,7 +12,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from ihbench.calibration import DESCRIPTIONS, ROWS
 from ihbench.metrics import Identity, Mean, macro_mean
 from ihbench.metrics.statistics import Interval, mean_interval
 from ihbench.reports.marks import marks_by_interval, marks_by_value
@@ -23,6 +22,7 @@ from ihbench.results import RunResult, group_row
 from ihbench.row_choice import EVERYTHING, Choice
 from ihbench.row_labels import by_label
 from ihbench.scene.protocol import REGIONS
+from ihbench.score.calibration import DESCRIPTIONS, ROWS
 
 Kind = Literal["quoted", "real data", "stand-in"]
 MEASURED = {"real data": "measured", "stand-in": "stand-in"}  # a block's kind -> the status of its numbers

@@ -112,7 +112,7 @@ class ReadRow:
 
     @property
     def ranked(self) -> bool:
-        from ihbench.calibration import ROWS
+        from ihbench.score.calibration import ROWS
 
         first = self.label.partition(" / ")[0]  # what follows tells rows of one name apart
         return first not in ROWS and UNRANKED.match(self.label) is None

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 from rich.cells import cell_len, set_cell_size
 
-from ihbench.calibration import ROWS
 from ihbench.errors import visible
 from ihbench.metrics import Identity, macro_mean
 from ihbench.metrics.identity import metric_of
@@ -15,6 +14,7 @@ from ihbench.reports.clock import one_clock
 from ihbench.reports.significance import scene_means
 from ihbench.results import TRACEBACK, RunResult
 from ihbench.row_labels import by_label
+from ihbench.score.calibration import ROWS
 
 WIDTH = 80
 NARROWEST = 40

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.body import texel_table
-from ihbench.calibration import Calibration
 from ihbench.camera import Camera
 from ihbench.clock.ledger import Ledger
 from ihbench.data_check import fitness
@@ -31,7 +30,8 @@ from ihbench.scene.plan import measure_scene
 from ihbench.scene.protocol import Protocol, Span
 from ihbench.scene.views import OccludedScene, open_scene
 from ihbench.scene.visibility import texel_visibility
-from ihbench.scoring import Scorer
+from ihbench.score.calibration import Calibration
+from ihbench.score.scoring import Scorer
 from ihbench.stress.case import Answer, Case, Unit, words_of
 from ihbench.stress.drawn_capture import (
     SIZE,

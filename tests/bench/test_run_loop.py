@@ -9,7 +9,6 @@ from PIL import Image
 
 import ihbench
 from ihbench import registry
-from ihbench.calibration import ROWS, Calibration
 from ihbench.clock.progress import Progress
 from ihbench.files import atomic
 from ihbench.files.atomic import read_json, read_json_lines
@@ -20,6 +19,7 @@ from ihbench.scene.contracts import MaskState
 from ihbench.scene.data_source import locate
 from ihbench.scene.protocol import load_protocol
 from ihbench.scene.views import open_scene
+from ihbench.score.calibration import ROWS, Calibration
 from tests.conftest import contents
 
 SWITCHES = {

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from ihbench import registry, source_digest
-from ihbench.calibration import Calibration
 from ihbench.clock.ledger import Ledger
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.scene.protocol import load_protocol
+from ihbench.score.calibration import Calibration
 from ihbench.shared_states import lender
 from ihbench.source_digest import bench_code, code_of, tree_digest
 from ihbench.store import RunFolder, identity_digest
@@ -51,7 +51,12 @@ OF_THE_BENCH = [
         "ihbench/scene/visibility.py",
     ),
     *("ihbench/metrics/ssim.py", "ihbench/metrics/flip_numba.py", "ihbench/metrics/presets.py"),
-    *("ihbench/scoring.py", "ihbench/score_stage.py", "ihbench/calibration.py", "ihbench/predictions.py"),
+    *(
+        "ihbench/score/scoring.py",
+        "ihbench/score_stage.py",
+        "ihbench/score/calibration.py",
+        "ihbench/score/predictions.py",
+    ),
     *(
         "ihbench/scene/plan.py",
         "ihbench/scene/protocol.py",

@@ -1,0 +1,1 @@
+"""Truth against prediction: scored views, calibration rows, folders of predictions."""
