@@ -22,7 +22,7 @@ from ihbench.commands.keep import check_keep
 from ihbench.commands.scene_choice import OcclusionChoice, ProtocolChanges
 from ihbench.errors import BadInput
 from ihbench.files.paths import user_path
-from ihbench.results import RunResult
+from ihbench.record.results import RunResult
 from ihbench.scene.protocol import Protocol, load_protocol
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from ihbench.clock.gpu_slots import only
 from ihbench.clock.interruption import GRACE, end_with_parent, interruptible, reason_of
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
-from ihbench.results import RunResult, read_result
+from ihbench.record.results import RunResult, read_result
 from ihbench.run_loop import RunRequest, run_scene
 from ihbench.scene.data_source import DataSource
 

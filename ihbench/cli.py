@@ -12,7 +12,7 @@ from ihbench.clock import streams
 from ihbench.clock.failures import Failure, explained, one_line
 from ihbench.clock.interruption import interruptible
 from ihbench.errors import BadInput
-from ihbench.provenance import description, note_command
+from ihbench.record.provenance import description, note_command
 from ihbench.version import __version__
 
 COMMANDS = {

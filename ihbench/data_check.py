@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench import outputs, registry
+from ihbench import registry
 from ihbench.errors import BadInput
+from ihbench.record import outputs
 from ihbench.scene.contracts import Capture
 from ihbench.scene.protocol import Protocol, load_protocol
 

@@ -17,10 +17,10 @@ from ihbench.clock.ledger import Ledger, OnCheckpoint
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput, Diverged
 from ihbench.files import atomic, removal
-from ihbench.results import TRACEBACK, RunResult, read_result
+from ihbench.record.results import TRACEBACK, RunResult, read_result
+from ihbench.record.store import RunFolder, RunIdentity, note_interruption
 from ihbench.scene.contracts import Capture
 from ihbench.scene.protocol import Protocol
-from ihbench.store import RunFolder, RunIdentity, note_interruption
 
 
 class RecordedRun(ABC):

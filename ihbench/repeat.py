@@ -9,11 +9,11 @@ from typing import Any
 
 from ihbench.config_fields import flat, with_fields
 from ihbench.errors import BadInput
-from ihbench.reopen import reopen_protocol
-from ihbench.results import RunResult, read_result
+from ihbench.record.reopen import reopen_protocol
+from ihbench.record.results import RunResult, read_result
+from ihbench.record.store import RunFolder
 from ihbench.run_loop import RunRequest, configuration
 from ihbench.score_predictions import MADE_ELSEWHERE
-from ihbench.store import RunFolder
 
 NOT_SWITCHES = ("keep", "outside")  # of a recorded configuration
 

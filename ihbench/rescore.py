@@ -16,13 +16,13 @@ from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.images import read_image
 from ihbench.metrics.evaluate import Preset, find_preset
-from ihbench.record import preset_lines
-from ihbench.reopen import reopen_protocol, reopen_scene
-from ihbench.results import view_rows
+from ihbench.record.reopen import reopen_protocol, reopen_scene
+from ihbench.record.results import view_rows
+from ihbench.record.schema import preset_lines
+from ihbench.record.source_digest import bench_code
+from ihbench.record.store import RunFolder
 from ihbench.score.scoring import LoadedView, Scorer, ViewScores
 from ihbench.score_stage import ScoreStage, render_path
-from ihbench.source_digest import bench_code
-from ihbench.store import RunFolder
 
 
 def rescore(folder: Path, preset: str, data: Path | None, body: Path | None, progress: Progress) -> None:

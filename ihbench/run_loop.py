@@ -25,10 +25,12 @@ from ihbench.clock.progress import Progress
 from ihbench.config_fields import flat, with_fields
 from ihbench.errors import BadInput
 from ihbench.metrics import mean_over_frames
-from ihbench.provenance import command
+from ihbench.record.provenance import command
+from ihbench.record.reopen import reopen_body, reopen_capture
+from ihbench.record.results import RunResult
+from ihbench.record.source_digest import code_of, shipped_digest
+from ihbench.record.store import RunFolder, RunIdentity, is_finished
 from ihbench.recorded_run import RecordedRun, about_scene, recorded
-from ihbench.reopen import reopen_body, reopen_capture
-from ihbench.results import RunResult
 from ihbench.scene.capture_digest import capture_digest
 from ihbench.scene.contracts import Avatar, Capture, Method, TestView, TrainingSet
 from ihbench.scene.data_source import DataSource
@@ -38,8 +40,6 @@ from ihbench.scene.views import OccludedScene, open_scene
 from ihbench.score.curve_views import curve_views
 from ihbench.score.scoring import Scorer
 from ihbench.score_stage import ScoreStage
-from ihbench.source_digest import code_of, shipped_digest
-from ihbench.store import RunFolder, RunIdentity, is_finished
 
 if TYPE_CHECKING:
     from ihbench.body import Body

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 
 from ihbench.clock.progress import Progress
 from ihbench.prepared import Prepared
-from ihbench.provenance import command
+from ihbench.record.provenance import command
+from ihbench.record.results import RunResult, read_result
+from ihbench.record.source_digest import bench_code
+from ihbench.record.store import RunFolder, RunIdentity
 from ihbench.recorded_run import RecordedRun, about_scene, recorded
-from ihbench.results import RunResult, read_result
 from ihbench.scene.capture_digest import capture_digest
 from ihbench.scene.data_source import DataSource
 from ihbench.scene.protocol import Protocol
@@ -19,8 +21,6 @@ from ihbench.score.prediction_doubts import Doubts
 from ihbench.score.predictions import Predictions, find_alpha, find_predictions
 from ihbench.score.scoring import Scorer
 from ihbench.score_stage import ScoreStage
-from ihbench.source_digest import bench_code
-from ihbench.store import RunFolder, RunIdentity
 from ihbench.version import __version__
 
 if TYPE_CHECKING:

@@ -16,14 +16,14 @@ from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.images import write_png
 from ihbench.metrics.eight_bit import rounded
-from ihbench.record import score_lines
-from ihbench.results import group_row, view_rows
+from ihbench.record.results import group_row, view_rows
+from ihbench.record.schema import score_lines
+from ihbench.record.source_digest import bench_code
+from ihbench.record.store import RunFolder
 from ihbench.scene.views import OccludedScene
 from ihbench.score.calibration import ROWS, Calibration
 from ihbench.score.contact_sheet import SheetRow, contact_sheet
 from ihbench.score.scoring import LoadedView, Predictor, Scorer
-from ihbench.source_digest import bench_code
-from ihbench.store import RunFolder
 
 if TYPE_CHECKING:
     from ihbench.body import Body

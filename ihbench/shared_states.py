@@ -8,7 +8,7 @@ from typing import Any
 
 from ihbench.errors import BadInput
 from ihbench.files import atomic
-from ihbench.store import RunFolder
+from ihbench.record.store import RunFolder
 
 SAME_CLOCK = ("cpu", "gpu", "torch_threads")  # of a machine's identity: the state's seconds come with it
 

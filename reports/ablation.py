@@ -14,9 +14,9 @@ from ihbench.cells import CellOutcome
 from ihbench.metrics import Identity
 from ihbench.metrics.identity import Metric, metric_of
 from ihbench.metrics.statistics import Interval, holm, mean_interval, paired_test
+from ihbench.record.results import RunResult
 from ihbench.reports.clock import clock_notes, one_clock
 from ihbench.reports.significance import ALPHA, LEVEL, per_scene
-from ihbench.results import RunResult
 
 REGIONS = ("visible", "hidden", "never_seen")  # beside the headline
 PAPER = {"psnr": ("PSNR", 2), "ssim": ("SSIM", 4), "lpips": ("LPIPS*", 2)}

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from ihbench.record.results import RunResult
 from ihbench.reports.clock import by_machine
-from ihbench.results import RunResult
 
 IMAGE_SIZE = "image size"
 PROFILE = "profile"

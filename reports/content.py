@@ -9,7 +9,9 @@ from pathlib import Path
 from ihbench.errors import BadInput
 from ihbench.metrics import Identity, Mean, macro_mean
 from ihbench.metrics.identity import metric_of
-from ihbench.quality_time import Target
+from ihbench.record.quality_time import Target
+from ihbench.record.results import RunResult
+from ihbench.record.row_labels import by_label
 from ihbench.reports.clock import one_clock
 from ihbench.reports.document import (
     Block,
@@ -28,8 +30,6 @@ from ihbench.reports.inpainting import inpainting_section
 from ihbench.reports.ledger_table import ledger_section
 from ihbench.reports.run_time import across_sizes_section, run_time_section
 from ihbench.reports.significance import intervals_section
-from ihbench.results import RunResult
-from ihbench.row_labels import by_label
 from ihbench.score.calibration import DESCRIPTIONS, ROWS
 
 Rows = dict[str, dict[str, Mean]]  # of one run: row -> identity -> mean

@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ihbench import outputs
 from ihbench.document import diagram
 from ihbench.metrics import Identity
 from ihbench.metrics.identity import METRICS
 from ihbench.metrics.statistics import Interval, interval_ends
-from ihbench.quality_time import QualityCurve, error_of, pareto_set
+from ihbench.record import outputs
+from ihbench.record.quality_time import QualityCurve, error_of, pareto_set
+from ihbench.record.results import RunResult
+from ihbench.record.store import plain_name
 from ihbench.reports.configurations import Configuration, configurations, short_value, sweeps
 from ihbench.reports.run_time import (
     LEVEL,
@@ -29,8 +31,6 @@ from ihbench.reports.run_time import (
     standing,
     work_points,
 )
-from ihbench.results import RunResult
-from ihbench.store import plain_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,11 +9,11 @@ from pathlib import Path
 from urllib.parse import quote
 
 from ihbench.errors import visible
-from ihbench.quality_time import Target
+from ihbench.record.quality_time import Target
+from ihbench.record.results import RunResult
 from ihbench.reports.content import general_report, score_tables
 from ihbench.reports.document import Block, Bullets, Heading, Paragraph, Picture, Table, Words, spans
 from ihbench.reports.short_names import LONG, with_short_names
-from ihbench.results import RunResult
 
 MARKS = {"strong": "**", "emphasis": "*", "code": "`"}
 

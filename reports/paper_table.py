@@ -14,13 +14,13 @@ from typing import Any, Literal
 
 from ihbench.metrics import Identity, Mean, macro_mean
 from ihbench.metrics.statistics import Interval, mean_interval
+from ihbench.record.results import RunResult, group_row
+from ihbench.record.row_choice import EVERYTHING, Choice
+from ihbench.record.row_labels import by_label
 from ihbench.reports.marks import marks_by_interval, marks_by_value
 from ihbench.reports.paper_numbers import Column, Component, Group, PaperTable
 from ihbench.reports.short_names import Footnotes, split_label
 from ihbench.reports.significance import LEVEL, scene_means
-from ihbench.results import RunResult, group_row
-from ihbench.row_choice import EVERYTHING, Choice
-from ihbench.row_labels import by_label
 from ihbench.scene.protocol import REGIONS
 from ihbench.score.calibration import DESCRIPTIONS, ROWS
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from ihbench.results import RunResult
-from ihbench.row_labels import by_label
+from ihbench.record.results import RunResult
+from ihbench.record.row_labels import by_label
 
 PICTURES = {"contact_sheet.png": "test views", "inpainting.png": "painted training views"}
 SIGNATURE = b"\x89PNG\r\n\x1a\n"

@@ -14,7 +14,7 @@ import numpy as np
 from ihbench.metrics import Identity
 from ihbench.metrics.identity import metric_of
 from ihbench.metrics.statistics import Interval, mean_interval, median_interval
-from ihbench.quality_time import (
+from ihbench.record.quality_time import (
     NEVER,
     QualityCurve,
     Target,
@@ -26,11 +26,11 @@ from ihbench.quality_time import (
     round_targets,
     time_to_quality,
 )
+from ihbench.record.results import RunResult
 from ihbench.reports.clock import clock_notes
 from ihbench.reports.configurations import Configuration, configurations
 from ihbench.reports.document import Block, Heading, Paragraph, Table, Words, bullets
 from ihbench.reports.significance import LEVEL, per_scene
-from ihbench.results import RunResult
 
 ON_THE_CURVE = ("psnr", "flip")  # targets are chosen for these where none is stated
 SPREAD = f"{LEVEL:.0%}"

@@ -8,13 +8,13 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from ihbench import outputs
 from ihbench.commands.parse import options
 from ihbench.errors import BadInput
 from ihbench.files import atomic
+from ihbench.record import outputs
 
 if TYPE_CHECKING:
-    from ihbench.results import RunResult
+    from ihbench.record.results import RunResult
 
 FORMATS = {"md": "markdown", "tex": "latex", "html": "html"}  # -> module of the writer
 
@@ -57,9 +57,9 @@ class TableCommand:
 
     def main(self, argv: list[str]) -> int:
         chosen = options(TableOptions, argv, f"report {self.name}", self.summary)
+        from ihbench.record.row_choice import Choice
         from ihbench.reports.paper_numbers import paper_table
         from ihbench.reports.paper_table import build_frame
-        from ihbench.row_choice import Choice
 
         if chosen.region and chosen.regions:
             raise BadInput("--region and --regions: give one of them")
@@ -92,7 +92,7 @@ def _results(chosen: TableOptions, protocols: list[str]) -> tuple[list[RunResult
     """Runs under these protocols, and the folders left out. No folder of runs is no error: the paper's rows
     are there without one."""
     from ihbench.commands.report import say_left_out
-    from ihbench.index import Index
+    from ihbench.record.index import Index
 
     if not chosen.runs.is_dir():
         if chosen.runs != TableOptions.runs:

@@ -10,10 +10,10 @@ from rich.cells import cell_len, set_cell_size
 from ihbench.errors import visible
 from ihbench.metrics import Identity, macro_mean
 from ihbench.metrics.identity import metric_of
+from ihbench.record.results import TRACEBACK, RunResult
+from ihbench.record.row_labels import by_label
 from ihbench.reports.clock import one_clock
 from ihbench.reports.significance import scene_means
-from ihbench.results import TRACEBACK, RunResult
-from ihbench.row_labels import by_label
 from ihbench.score.calibration import ROWS
 
 WIDTH = 80

@@ -81,9 +81,9 @@ def ablated(
 ) -> tuple[str, dict[str, Any], list[CellOutcome]]:
     """Do the runs of a ladder, or of the grid `vary`, with `switches` on every rung: the table as Markdown and as
     numbers, and how each run ended. The options' own words for both are not read. Raises `BadInput`."""
-    from ihbench import outputs
     from ihbench.cells import run_cells
     from ihbench.clock.machine import usable_cores
+    from ihbench.record import outputs
 
     if not chosen.seed:
         raise BadInput("--seed: expected one number or more")
@@ -108,7 +108,7 @@ def ablated(
 
 def write_out(chosen: AblateOptions, text: str, numbers: dict[str, Any]) -> None:
     """Write the table into the folder that was asked for, if one was."""
-    from ihbench import outputs
+    from ihbench.record import outputs
 
     if chosen.out is not None:
         outputs.write_text(chosen.out / "ablation.md", text)

@@ -37,9 +37,9 @@ def main(argv: list[str]) -> int:
     chosen = options(ExportOptions, argv, "export", "An avatar's Gaussians as a standard splat PLY.")
     import numpy as np
 
-    from ihbench import outputs
     from ihbench.files.atomic import is_stream
     from ihbench.files.splat_ply import UPRIGHT, VIEWER_TURN, write_splat_ply
+    from ihbench.record import outputs
     from ihbench.run_loop import load_avatar
 
     outputs.check_file(chosen.out, chosen.data, chosen.body)
@@ -78,7 +78,7 @@ def _for_viewers(means: Any, pose: Any, avatar: Any, chosen: ExportOptions) -> A
     from ihbench.body.pose import BodyPose
     from ihbench.body.skinning_numpy import axis_angle_to_matrix
     from ihbench.files.splat_ply import in_viewer_axes
-    from ihbench.reopen import reopen_body
+    from ihbench.record.reopen import reopen_body
 
     body = getattr(avatar, "body", None) or reopen_body(chosen.run, chosen.data, chosen.body)
     pelvis = body.posed_joints(BodyPose(pose.pose, avatar.betas, pose.transl))[0]
@@ -87,7 +87,7 @@ def _for_viewers(means: Any, pose: Any, avatar: Any, chosen: ExportOptions) -> A
 
 def _comments(chosen: ExportOptions) -> list[str]:
     """What the file says of itself. Brush and splat-transform read the last."""
-    from ihbench.store import RunFolder
+    from ihbench.record.store import RunFolder
 
     folder = RunFolder.open(chosen.run)
     identity = folder.identity

@@ -32,11 +32,11 @@ def main(argv: list[str]) -> int:
 
 def _planned(chosen: SceneChoice, protocol: Protocol) -> dict[str, Any]:
     from ihbench.clock.machine import cpu_model
-    from ihbench.earlier_runs import earlier_runs
+    from ihbench.record.earlier_runs import earlier_runs
+    from ihbench.record.source_digest import code_of
     from ihbench.run_loop import configuration
     from ihbench.scene.data_source import locate, open_capture
     from ihbench.scene.plan import absent_regions, measure_scene
-    from ihbench.source_digest import code_of
 
     config = configuration(chosen.method, chosen.profile, {})
     leave_out = registry.load("config", chosen.method).leave_out

@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from ihbench import outputs, registry
+from ihbench import registry
 from ihbench.commands.parse import options
 from ihbench.errors import BadInput, visible
 from ihbench.files import atomic
+from ihbench.record import outputs
 
 if TYPE_CHECKING:
-    from ihbench.results import RunResult
+    from ihbench.record.results import RunResult
 
 SHOWN = 20  # folders left out that are named on stderr
 
@@ -75,9 +76,9 @@ def main(argv: list[str]) -> int:
     about = f"Tables of finished runs. Also: ihbench report {' | '.join(verbs)}, each with its --help."
     chosen = options(ReportOptions, argv, "report", about)
     from ihbench.metrics.evaluate import find_preset
-    from ihbench.quality_time import Target
-    from ihbench.results import read_results
-    from ihbench.row_choice import Choice
+    from ihbench.record.quality_time import Target
+    from ihbench.record.results import read_results
+    from ihbench.record.row_choice import Choice
 
     outputs.check_file(chosen.out, chosen.data, chosen.body)
     write = registry.load("report", chosen.format or "md")
@@ -118,8 +119,8 @@ def main(argv: list[str]) -> int:
 def _with_presets(result: RunResult, chosen: ReportOptions) -> RunResult:
     """The run with the numbers of the presets asked for; one whose data are not to be had is named and left out."""
     from ihbench.clock.progress import Progress
+    from ihbench.record.results import read_result
     from ihbench.rescore import rescore
-    from ihbench.results import read_result
 
     if result.status != "done":
         return result
@@ -135,7 +136,7 @@ def _with_presets(result: RunResult, chosen: ReportOptions) -> RunResult:
 
 def _matching(chosen: ReportOptions) -> tuple[list[RunResult], list[str]]:
     """Runs under --runs that match the filters, and the folders left out."""
-    from ihbench.index import Index
+    from ihbench.record.index import Index
 
     if not chosen.runs.is_dir():
         return [], []

@@ -19,7 +19,7 @@ from ihbench.commands.scene_choice import SceneChoice
 from ihbench.errors import BadInput
 
 if TYPE_CHECKING:
-    from ihbench.results import RunResult
+    from ihbench.record.results import RunResult
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,7 +139,7 @@ def _repeat(chosen: LikeOptions) -> int:
 
 
 def _print(results: list[RunResult], chosen: Any) -> int:
-    from ihbench.results import as_json
+    from ihbench.record.results import as_json
 
     if chosen.json:
         print(json.dumps(as_json(results), allow_nan=False))

@@ -19,7 +19,7 @@ from ihbench.errors import BadInput
 from ihbench.files import atomic
 
 if TYPE_CHECKING:
-    from ihbench.results import RunResult
+    from ihbench.record.results import RunResult
 
 DAMAGED = "damaged"
 FILTERS = ("protocol", "scene", "method", "profile", "seed", "status")
@@ -87,7 +87,7 @@ def _list(chosen: Filters) -> int:
 
 
 def _remove(chosen: Remove) -> int:
-    from ihbench.store import remove_run, writer_of
+    from ihbench.record.store import remove_run, writer_of
 
     filters = [name for name in FILTERS if getattr(chosen, name) is not None]
     if bool(chosen.run) == bool(filters):
@@ -132,8 +132,8 @@ def _agreed(chosen: Remove, rows: list[dict[str, Any]]) -> bool:
 
 def _matching(chosen: Filters) -> list[dict[str, Any]]:
     """The runs that the filters choose, oldest first. Damaged ones match no filter but their status."""
-    from ihbench.index import UNREADABLE, Index
-    from ihbench.store import STATUSES
+    from ihbench.record.index import UNREADABLE, Index
+    from ihbench.record.store import STATUSES
 
     if chosen.status is not None and chosen.status not in (*STATUSES, DAMAGED):
         raise BadInput(f"--status {chosen.status}: {registry.nearest(chosen.status, [*STATUSES, DAMAGED])}")
@@ -148,9 +148,9 @@ def _matching(chosen: Filters) -> list[dict[str, Any]]:
 
 def _named(chosen: Remove) -> Iterator[dict[str, Any]]:
     """The runs that are named, each once. Raises `BadInput` for one that is none."""
-    from ihbench.index import UNREADABLE
-    from ihbench.results import read_result
-    from ihbench.store import check_is_run
+    from ihbench.record.index import UNREADABLE
+    from ihbench.record.results import read_result
+    from ihbench.record.store import check_is_run
 
     seen = set()
     for named in chosen.run:
@@ -174,7 +174,7 @@ def _named(chosen: Remove) -> Iterator[dict[str, Any]]:
 
 
 def _row(folder: Path, entry: dict[str, Any], result: RunResult | None) -> dict[str, Any]:
-    from ihbench.index import UNREADABLE
+    from ihbench.record.index import UNREADABLE
 
     name, value = _headline(result)
     about = {key: entry.get(key) for key in ("protocol", "scene", "method", "profile", "seed", "reason", "created")}

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from ihbench.clock.progress import Progress
     from ihbench.prepared import Prepared
-    from ihbench.results import RunResult
+    from ihbench.record.results import RunResult
     from ihbench.scene.data_source import DataSource
 
 
@@ -61,7 +61,7 @@ class ScoreOptions(ProtocolChanges):
 def main(argv: list[str]) -> int:
     chosen = options(ScoreOptions, argv, "score", "Score images that somebody else's code rendered.")
     from ihbench.clock.progress import Progress
-    from ihbench.results import as_json
+    from ihbench.record.results import as_json
 
     if chosen.names:
         return _print_names(chosen, _source(chosen)[0])

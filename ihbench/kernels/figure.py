@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ihbench import outputs
 from ihbench.document import diagram
 from ihbench.kernels.measuring import Row
+from ihbench.record import outputs
 
 COLUMNS = 3
 UNITS = {

@@ -25,8 +25,8 @@ from ihbench.methods.inpainthuman.stage2 import STATE as PAINTED_STATE
 from ihbench.methods.inpainthuman.stage2 import Stage2
 from ihbench.methods.inpainthuman.stage3 import Stage3
 from ihbench.metrics import mean_over_frames
-from ihbench.reopen import reopen_scene
-from ihbench.results import read_result
+from ihbench.record.reopen import reopen_scene
+from ihbench.record.results import read_result
 from ihbench.scene.contracts import MaskState, TrainingSet, TrainView
 from ihbench.scene.views import OccludedScene, uncovered
 from ihbench.score.scoring import Scorer

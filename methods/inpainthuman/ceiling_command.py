@@ -47,10 +47,10 @@ def main(argv: list[str]) -> int:
 
 
 def _ceiling(chosen: CeilingOptions) -> int:
-    from ihbench import outputs
     from ihbench.clock.progress import Progress
     from ihbench.methods.inpainthuman.ceiling import ceiling
-    from ihbench.results import read_result
+    from ihbench.record import outputs
+    from ihbench.record.results import read_result
 
     if not chosen.run:
         raise BadInput("ceiling: of which run? give one or more run folders")

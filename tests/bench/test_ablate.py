@@ -23,13 +23,13 @@ from ihbench.config_fields import flat
 from ihbench.errors import BadInput
 from ihbench.files.atomic import read_json
 from ihbench.methods.inpainthuman.config import LEAST_TEXELS, PROFILES, QUICK
-from ihbench.results import read_result
+from ihbench.record.results import read_result
+from ihbench.record.store import RunFolder
 from ihbench.run_loop import RunRequest, _planned
 from ihbench.scene.data_source import DataSource
 from ihbench.scene.plan import SceneMeasure
 from ihbench.scene.protocol import load_protocol
 from ihbench.shared_states import lend, lender
-from ihbench.store import RunFolder
 from tests.conftest import SCENES
 
 TINY = ["texels=32", "levels=16", "decoder_width=32", "position_map=16"]

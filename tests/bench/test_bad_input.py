@@ -14,9 +14,9 @@ from PIL import Image
 from ihbench.clock.ledger import Ledger
 from ihbench.files import locks
 from ihbench.files.atomic import read_json
-from ihbench.results import read_result
+from ihbench.record.results import read_result
+from ihbench.record.store import RunFolder
 from ihbench.scene import data_source
-from ihbench.store import RunFolder
 from tests.conftest import contents, tiny_protocol
 
 SUBJECT = "CoreView_standin-1"

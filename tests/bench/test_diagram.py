@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ihbench import outputs
 from ihbench.document import diagram
 from ihbench.document.diagram import Label, place_labels, round_ticks, tick_text
+from ihbench.record import outputs
 
 
 @given(st.floats(-12, 8), st.floats(0.05, 14))

@@ -14,11 +14,11 @@ from dataclasses import replace
 
 import pytest
 
-from ihbench import index
 from ihbench.errors import BadInput
-from ihbench.index import Index
-from ihbench.results import read_result
-from ihbench.store import RunFolder
+from ihbench.record import index
+from ihbench.record.index import Index
+from ihbench.record.results import read_result
+from ihbench.record.store import RunFolder
 from tests.bench.test_store import IDENTITY
 from tests.reports.fake_runs import about
 

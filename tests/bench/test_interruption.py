@@ -18,10 +18,10 @@ from ihbench.clock.interruption import Terminated, interruptible, undisturbed
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.files.atomic import read_json
-from ihbench.index import Index
+from ihbench.record.index import Index
+from ihbench.record.results import read_result
+from ihbench.record.store import KILLED, RunFolder
 from ihbench.recorded_run import RecordedRun, recorded
-from ihbench.results import read_result
-from ihbench.store import KILLED, RunFolder
 from tests.bench.test_store import IDENTITY
 
 # a run that waits for its end, as `ihbench run` makes one

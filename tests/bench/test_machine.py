@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ihbench import provenance
 from ihbench.clock import machine
 from ihbench.files import atomic
+from ihbench.record import provenance
 
 
 def test_identity_is_complete_and_fits_into_json():

@@ -13,7 +13,7 @@ from ihbench.clock.progress import Progress
 from ihbench.datasets import plain_scene
 from ihbench.errors import BadInput
 from ihbench.files.images import write_png
-from ihbench.results import read_result
+from ihbench.record.results import read_result
 from ihbench.scene.data_source import body_file, locate
 from ihbench.scene.protocol import load_protocol
 from ihbench.scene.views import open_scene

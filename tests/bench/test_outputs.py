@@ -9,11 +9,11 @@ import sys
 
 import pytest
 
-from ihbench import outputs
 from ihbench.cli import main
 from ihbench.document import diagram
 from ihbench.errors import BadInput
 from ihbench.files import atomic
+from ihbench.record import outputs
 from tests.conftest import contents
 
 

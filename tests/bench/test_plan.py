@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from ihbench.body import texel_table
 from ihbench.body.pose import BodyPose
 from ihbench.config_fields import flat, with_fields
-from ihbench.earlier_runs import earlier_runs
 from ihbench.methods.inpainthuman import config as method_config
 from ihbench.methods.inpainthuman.config import (
     LEAST_TEXELS,
@@ -21,6 +20,7 @@ from ihbench.methods.inpainthuman.config import (
     RESIDUAL_SHARE,
     leave_out,
 )
+from ihbench.record.earlier_runs import earlier_runs
 from ihbench.scene import plan
 from ihbench.scene.plan import (
     TEXELS,

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from ihbench.clock.ledger import Ledger
 from ihbench.errors import BadInput
-from ihbench.quality_time import (
+from ihbench.record.quality_time import (
     NEVER,
     QualityCurve,
     Target,

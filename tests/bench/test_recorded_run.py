@@ -11,8 +11,8 @@ from ihbench.clock import machine
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.files import atomic
+from ihbench.record.store import RunFolder
 from ihbench.recorded_run import RecordedRun, recorded
-from ihbench.store import RunFolder
 from tests.bench.test_store import IDENTITY
 
 

@@ -11,15 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ihbench import store
 from ihbench.cli import main
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.files import locks, removal
 from ihbench.prepare import prepare
+from ihbench.record import store
+from ihbench.record.store import RunFolder
 from ihbench.scene.views import open_scene
-from ihbench.store import RunFolder
 from tests.bench.fake_capture import fake_protocol, the_body, turning_capture
 from tests.bench.test_store import IDENTITY
 from tests.conftest import contents
@@ -53,7 +53,7 @@ def test_only_one_module_removes():
         "ihbench/files/locks.py": {"os.rename", "unlink"},
         "ihbench/prepare.py": {"os.rename", "rmdir"},
         "ihbench/files/removal.py": {"os.replace", "rmdir", "shutil.rmtree", "unlink"},
-        "ihbench/store.py": {"os.rename", "rmdir"},
+        "ihbench/record/store.py": {"os.rename", "rmdir"},
     }
 
 

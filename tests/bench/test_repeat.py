@@ -6,9 +6,10 @@ import shutil
 
 import pytest
 
-from ihbench import provenance, registry
+from ihbench import registry
 from ihbench.files.atomic import read_json, write_json
-from ihbench.store import RunIdentity
+from ihbench.record import provenance
+from ihbench.record.store import RunIdentity
 from tests.conftest import contents
 
 

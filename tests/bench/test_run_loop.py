@@ -14,7 +14,7 @@ from ihbench.files import atomic
 from ihbench.files.atomic import read_json, read_json_lines
 from ihbench.methods.inpainthuman.config import QUICK
 from ihbench.metrics import psnr
-from ihbench.results import read_result
+from ihbench.record.results import read_result
 from ihbench.scene.contracts import MaskState
 from ihbench.scene.data_source import locate
 from ihbench.scene.protocol import load_protocol

@@ -8,7 +8,7 @@ import shutil
 
 import pytest
 
-from ihbench.store import RunFolder
+from ihbench.record.store import RunFolder
 from tests.conftest import contents
 from tests.reports.fake_runs import about, identity, write_run
 from tests.reports.test_report_verbs import ihbench  # noqa: F401 (a fixture)

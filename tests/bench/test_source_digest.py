@@ -12,15 +12,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ihbench import registry, source_digest
+from ihbench import registry
 from ihbench.clock.ledger import Ledger
 from ihbench.errors import BadInput
 from ihbench.files import atomic
+from ihbench.record import source_digest
+from ihbench.record.source_digest import bench_code, code_of, tree_digest
+from ihbench.record.store import RunFolder, identity_digest
 from ihbench.scene.protocol import load_protocol
 from ihbench.score.calibration import Calibration
 from ihbench.shared_states import lender
-from ihbench.source_digest import bench_code, code_of, tree_digest
-from ihbench.store import RunFolder, identity_digest
 from tests.bench.test_house import imports
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -72,7 +73,7 @@ OF_NO_NUMBER = [
     *(
         "ihbench/metrics/oracles/check.py",
         "ihbench/document/diagram.py",
-        "ihbench/row_labels.py",
+        "ihbench/record/row_labels.py",
         "protocols/zju_occ.toml",
     ),
     *("methods/inpainthuman/card.toml", "methods/inpainthuman/METHOD.md"),

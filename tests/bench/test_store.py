@@ -15,11 +15,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ihbench import store
 from ihbench.clock.ledger import Ledger
 from ihbench.errors import BadInput
 from ihbench.files import locks
-from ihbench.store import RunFolder, RunIdentity
+from ihbench.record import store
+from ihbench.record.store import RunFolder, RunIdentity
 
 IDENTITY = RunIdentity(
     protocol="zju_occ@1", protocol_digest="0123456789abcdef", dataset="zju_mocap", scene="377",
@@ -245,7 +245,7 @@ def test_warnings_are_kept_once(tmp_path):
 # --- locks ---
 
 HOLD = (
-    "import sys, time; from pathlib import Path; from ihbench.store import RunFolder\n"
+    "import sys, time; from pathlib import Path; from ihbench.record.store import RunFolder\n"
     "with RunFolder.open(Path(sys.argv[1])).lock():\n"
     "    print('held', flush=True); time.sleep(60)"
 )

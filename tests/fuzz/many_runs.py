@@ -15,8 +15,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from unittest.mock import patch
 
-from ihbench import index
 from ihbench.cli import main
+from ihbench.record import index
 from tests.fuzz.records import make_run
 
 SHAPES = {  # of the k-th run: method, scene, seed, changed switches

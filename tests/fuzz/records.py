@@ -17,15 +17,15 @@ from ihbench.ablation import Comparison, Ladder, Rung
 from ihbench.cells import Cell, CellOutcome
 from ihbench.cli import main
 from ihbench.clock.ledger import Ledger
-from ihbench.earlier_runs import earlier_runs
 from ihbench.errors import BadInput
 from ihbench.files import atomic
-from ihbench.index import Index
-from ihbench.reopen import reopen_body, reopen_capture, reopen_protocol
+from ihbench.record.earlier_runs import earlier_runs
+from ihbench.record.index import Index
+from ihbench.record.reopen import reopen_body, reopen_capture, reopen_protocol
+from ihbench.record.results import read_result
+from ihbench.record.store import RunFolder
 from ihbench.reports import ablation
-from ihbench.results import read_result
 from ihbench.shared_states import lend, lender
-from ihbench.store import RunFolder
 from tests.reports.fake_runs import LPIPS, PSNR, SSIM, about, identity
 
 MISSING = object()

@@ -12,7 +12,7 @@ import pytest
 from ihbench.methods.inpainthuman.ceiling import CeilingRow, painted_psnr, with_truth
 from ihbench.methods.inpainthuman.ceiling_command import table
 from ihbench.methods.inpainthuman.inpainting.painted_view import PaintedView
-from ihbench.results import read_result
+from ihbench.record.results import read_result
 from ihbench.scene.contracts import MaskState, TrainView
 from tests.bench.fake_capture import a_camera, a_pose
 from tests.conftest import TINY_SWITCHES

@@ -9,8 +9,8 @@ from typing import Any
 
 from ihbench.files import atomic
 from ihbench.metrics import Mean
-from ihbench.results import RunResult
-from ihbench.store import RunFolder, RunIdentity
+from ihbench.record.results import RunResult
+from ihbench.record.store import RunFolder, RunIdentity
 
 PSNR, SSIM, LPIPS = "psnr/pooled/range1/{}/v1", "ssim/gauss11-1.5/range1/{}/v1", "lpips/vgg0.1/range-1,1/{}/v1"
 STANDIN = "stand-in v1 seed 0"

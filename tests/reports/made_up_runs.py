@@ -8,8 +8,8 @@ from datetime import datetime, timedelta
 from pathlib import Path
 
 from ihbench.metrics import Mean
-from ihbench.record import curve_points
-from ihbench.results import RunResult
+from ihbench.record.results import RunResult
+from ihbench.record.schema import curve_points
 
 PSNR, FLIP = "psnr/pooled/range1/{}/v1", "flip/ldr-67ppd/srgb/{}/v1"
 REGIONS = ("body", "hidden")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ihbench.record.results import RunResult
 from ihbench.reports.inpainting import inpainting_section
 from ihbench.reports.markdown import markdown
-from ihbench.results import RunResult
 
 
 def event(delta_e, views=3):

@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 
 from ihbench.errors import BadInput
+from ihbench.record.row_choice import Choice
 from ihbench.reports import html, latex, markdown, table_html, table_latex, table_markdown
 from ihbench.reports.metric_names import head_metric
 from ihbench.reports.paper_numbers import paper_table
@@ -16,7 +17,6 @@ from ihbench.reports.paper_table import build_frame
 from ihbench.reports.short_names import split_label, with_short_names
 from ihbench.reports.table_lint import lint
 from ihbench.reports.table_reading import read_tables
-from ihbench.row_choice import Choice
 from tests.reports.fake_runs import SUBJECTS, fake_run
 from tests.reports.made_up_runs import FLIP, PSNR, made_up, sweep
 from tests.reports.test_ablation import rung, told

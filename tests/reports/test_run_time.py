@@ -10,7 +10,7 @@ from dataclasses import replace
 import pytest
 
 from ihbench.metrics.statistics import Interval
-from ihbench.quality_time import Target
+from ihbench.record.quality_time import Target
 from ihbench.reports.configurations import configurations, sweeps
 from ihbench.reports.figures import ROOM, _shown, draw
 from ihbench.reports.html import write as html_write

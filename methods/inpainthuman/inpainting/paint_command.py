@@ -56,10 +56,11 @@ def main(argv: list[str]) -> int:
 
 
 def _paint(chosen: Any) -> int:
-    from ihbench import outputs, registry
+    from ihbench import registry
     from ihbench.clock.progress import Progress
     from ihbench.methods.inpainthuman.inpainting.grid import png
     from ihbench.methods.inpainthuman.inpainting.paint_table import paint_scene, summary, table
+    from ihbench.record import outputs
     from ihbench.scene.data_source import locate
     from ihbench.scene.protocol import load_protocol
 

@@ -22,8 +22,8 @@ from typing import Any
 from ihbench.errors import BadInput
 from ihbench.files import removal
 from ihbench.metrics import Mean
-from ihbench.results import RunResult, read_result, without_copies
-from ihbench.store import INDEX, KILLED, OUR_NAME
+from ihbench.record.results import RunResult, read_result, without_copies
+from ihbench.record.store import INDEX, KILLED, OUR_NAME
 from ihbench.version import __version__
 
 UNREADABLE = "unreadable"
@@ -317,8 +317,9 @@ def _make(database: sqlite3.Connection) -> None:
 @cache
 def this_code() -> str:
     """Changes with the code that reads run folders: what other code has read is read again."""
-    from ihbench import record, results, shape, store
     from ihbench.metrics import aggregate, identity
+    from ihbench.record import results, shape, store
+    from ihbench.record import schema as record
 
     digest = hashlib.sha256(f"{__version__}\n{SCHEMA}".encode())
     for module in (record, results, shape, store, aggregate, identity):

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 from ihbench.body import load_body
 from ihbench.errors import BadInput
-from ihbench.record import outcome_fault
+from ihbench.record.schema import outcome_fault
+from ihbench.record.store import RunFolder
 from ihbench.scene.capture_digest import capture_digest
 from ihbench.scene.contracts import Capture
 from ihbench.scene.data_source import open_capture, own_body, own_data, standin_root
 from ihbench.scene.protocol import Protocol, load_protocol, protocol_from
 from ihbench.scene.views import OccludedScene, open_scene
-from ihbench.store import RunFolder
 
 if TYPE_CHECKING:
     from ihbench.body import Body

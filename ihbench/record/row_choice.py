@@ -8,9 +8,9 @@ from typing import Any
 
 from ihbench.errors import BadInput
 from ihbench.metrics import Identity
+from ihbench.record.results import RunResult
+from ihbench.record.row_labels import by_configuration
 from ihbench.registry import nearest
-from ihbench.results import RunResult
-from ihbench.row_labels import by_configuration
 from ihbench.score.calibration import ROWS
 
 

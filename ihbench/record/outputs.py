@@ -16,7 +16,7 @@ from typing import Any
 
 from ihbench.errors import BadInput
 from ihbench.files import atomic, removal
-from ihbench.store import INDEX, is_record
+from ihbench.record.store import INDEX, is_record
 
 LIST = ".ihbench-written.json"
 

@@ -29,8 +29,8 @@ from ihbench.clock.interruption import undisturbed
 from ihbench.clock.ledger import Ledger, is_saved_state
 from ihbench.errors import BadInput
 from ihbench.files import atomic, locks, removal
-from ihbench.provenance import provenance
-from ihbench.record import Status, curve_points, read_json, record_fault, score_lines
+from ihbench.record.provenance import provenance
+from ihbench.record.schema import Status, curve_points, read_json, record_fault, score_lines
 
 SCHEMA_VERSION = 1
 STATUSES = get_args(Status)

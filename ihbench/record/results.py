@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.metrics import Mean, Score, mean_over_frames
-from ihbench.record import curve_points, outcome_fault, preset_lines, score_lines
-from ihbench.store import RunFolder
+from ihbench.record.schema import curve_points, outcome_fault, preset_lines, score_lines
+from ihbench.record.store import RunFolder
 
 if TYPE_CHECKING:
     from ihbench.score.scoring import ViewScores
@@ -24,7 +24,7 @@ Rows = dict[str, dict[str, Mean]]  # row name -> identity -> mean over the scene
 
 @dataclass(frozen=True)
 class RunResult:
-    """One run folder, read and checked: see `ihbench.record`."""
+    """One run folder, read and checked: see `ihbench.record.schema`."""
 
     folder: Path
     record: dict[str, Any]  # run.json

@@ -9,7 +9,7 @@ from statistics import median
 from typing import Any
 
 from ihbench.errors import BadInput
-from ihbench.store import RunFolder
+from ihbench.record.store import RunFolder
 
 
 @dataclass(frozen=True)

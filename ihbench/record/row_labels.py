@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ihbench.results import RunResult
+from ihbench.record.results import RunResult
 
 
 def by_label(runs: Sequence[RunResult]) -> dict[str, list[RunResult]]:

@@ -19,7 +19,7 @@ from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.regular import read_bytes
 from ihbench.metrics.identity import Identity as MetricIdentity
-from ihbench.shape import WHOLE, Matches, Within, fault
+from ihbench.record.shape import WHOLE, Matches, Within, fault
 
 LARGEST_RECORD = 32 * 2**20  # bytes; no honest run.json comes near
 LARGEST_TABLE = 256 * 2**20  # bytes; nor do scores

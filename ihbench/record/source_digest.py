@@ -29,15 +29,15 @@ from ihbench.version import __version__
 if TYPE_CHECKING:
     from ihbench.scene.protocol import Protocol
 
-BENCH = Path(__file__).resolve().parent
+BENCH = Path(__file__).resolve().parents[1]
 # of the bench: commands, what only shows or checks numbers, and the rooms, which are asked for one by one
 NOT_IN_NUMBERS = (
     *(f"{room}/*" for room in registry.ROOMS),
     "commands/*", "kernels/*", "stress/*", "__main__.py", "cli.py", "clock/progress.py", "errors.py", "registry.py",
-    "ablation.py", "cells.py", "earlier_runs.py", "index.py", "quality_time.py",
-    "score/contact_sheet.py", "document/*", "files/splat_ply.py", "row_choice.py", "row_labels.py",
+    "ablation.py", "cells.py", "record/earlier_runs.py", "record/index.py", "record/quality_time.py",
+    "score/contact_sheet.py", "document/*", "files/splat_ply.py", "record/row_choice.py", "record/row_labels.py",
     "api.py", "repeat.py", "clock/gpu_slots.py", "clock/failures.py", "clock/streams.py",
-    "clock/machine.py", "provenance.py", "clock/threads.py",
+    "clock/machine.py", "record/provenance.py", "clock/threads.py",
     "metrics/oracles/*",
 )  # fmt: skip
 DESCRIPTIONS = ("*.md", "*.rst", "*.typed", "*~", ".*", "card.toml")

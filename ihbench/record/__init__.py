@@ -1,0 +1,1 @@
+"""Runs on disk: typed records, their index, identities and results."""
