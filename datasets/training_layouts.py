@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
+from ihbench.data.prepare import Handout
 from ihbench.datasets import gaussianavatar, humannerf, instantavatar, ocmotion_w2a, zju_mocap, zju_refine
 from ihbench.files import atomic
 from ihbench.files.pictures import encoded
-from ihbench.prepare import Handout
 
 
 def zju(handout: Handout) -> Path:

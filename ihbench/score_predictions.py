@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ihbench.clock.progress import Progress
-from ihbench.prepared import Prepared
+from ihbench.data.prepared import Prepared
 from ihbench.record.provenance import command
 from ihbench.record.results import RunResult, read_result
 from ihbench.record.source_digest import bench_code

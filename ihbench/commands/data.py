@@ -63,7 +63,7 @@ def main(argv: list[str]) -> int:
 
 def _check(chosen: Check) -> int:
     from ihbench.body import load_body
-    from ihbench.data_check import add_fitness
+    from ihbench.data.data_check import add_fitness
     from ihbench.scene.data_source import body_file, folder_nearby, is_about_a_file, own_body, own_data
 
     folder = own_data(chosen.folder)

@@ -45,7 +45,7 @@ def main(argv: list[str]) -> int:
     chosen = options(PrepareOptions, argv, "prepare", "Write the occluded training set, and nothing that it hides.")
     from ihbench import registry
     from ihbench.clock.progress import Progress
-    from ihbench.prepare import check_target, prepare
+    from ihbench.data.prepare import check_target, prepare
     from ihbench.scene.data_source import locate, own_body
     from ihbench.scene.protocol import load_protocol
     from ihbench.scene.views import open_scene

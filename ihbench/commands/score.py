@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from ihbench.clock.progress import Progress
-    from ihbench.prepared import Prepared
+    from ihbench.data.prepared import Prepared
     from ihbench.record.results import RunResult
     from ihbench.scene.data_source import DataSource
 
@@ -107,7 +107,7 @@ def scored(chosen: ScoreOptions, progress: Progress) -> list[RunResult]:
 
 def _source(chosen: ScoreOptions) -> tuple[DataSource, Prepared | None]:
     """What is scored: under which protocol, on which data, and what was prepared of it."""
-    from ihbench.prepared import read_prepared
+    from ihbench.data.prepared import read_prepared
     from ihbench.scene.data_source import locate
     from ihbench.scene.protocol import PROFILES, load_protocol
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ihbench.body import texel_table
 from ihbench.camera import Camera
 from ihbench.clock.ledger import Ledger
-from ihbench.data_check import fitness
+from ihbench.data.data_check import fitness
 from ihbench.errors import BadInput
 from ihbench.files.atomic import read_json, write_json
 from ihbench.files.images import read_image

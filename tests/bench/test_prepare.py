@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from ihbench.clock.progress import Progress
+from ihbench.data.prepare import prepare
 from ihbench.errors import BadInput
-from ihbench.prepare import prepare
 from ihbench.scene.contracts import MaskState
 from ihbench.scene.views import open_scene
 from tests.bench.fake_capture import fake_protocol, the_body, turning_capture

@@ -14,9 +14,9 @@ import pytest
 from ihbench.cli import main
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
+from ihbench.data.prepare import prepare
 from ihbench.errors import BadInput
 from ihbench.files import locks, removal
-from ihbench.prepare import prepare
 from ihbench.record import store
 from ihbench.record.store import RunFolder
 from ihbench.scene.views import open_scene
@@ -51,7 +51,7 @@ def test_only_one_module_removes():
     assert found == {
         "ihbench/files/atomic.py": {"os.replace"},
         "ihbench/files/locks.py": {"os.rename", "unlink"},
-        "ihbench/prepare.py": {"os.rename", "rmdir"},
+        "ihbench/data/prepare.py": {"os.rename", "rmdir"},
         "ihbench/files/removal.py": {"os.replace", "rmdir", "shutil.rmtree", "unlink"},
         "ihbench/record/store.py": {"os.rename", "rmdir"},
     }

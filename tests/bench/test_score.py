@@ -11,10 +11,10 @@ from PIL import Image
 
 from ihbench.api import load_scene
 from ihbench.clock.progress import Progress
+from ihbench.data.prepared import read_prepared
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.images import read_image
-from ihbench.prepared import read_prepared
 from ihbench.scene.data_source import standin_root
 from ihbench.scene.views import TestViewKey, open_scene
 from ihbench.score.predictions import find_alpha, find_predictions

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ihbench import registry
+from ihbench.data.prepare import MANIFEST
 from ihbench.errors import BadInput
 from ihbench.files import atomic
-from ihbench.prepare import MANIFEST
 from ihbench.scene.contracts import Capture
 from ihbench.scene.data_source import DataSource, locate, own_data, standin_root
 from ihbench.scene.protocol import Protocol, protocol_from

@@ -1,0 +1,1 @@
+"""Checking a copy of a data set, and handing out an occluded training set."""
