@@ -9,14 +9,14 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ihbench.ablation import Comparison, Ladder
-from ihbench.cells import CellOutcome
 from ihbench.metrics import Identity
 from ihbench.metrics.identity import Metric, metric_of
 from ihbench.metrics.statistics import Interval, holm, mean_interval, paired_test
 from ihbench.record.results import RunResult
 from ihbench.reports.clock import clock_notes, one_clock
 from ihbench.reports.significance import ALPHA, LEVEL, per_scene
+from ihbench.run.ablation import Comparison, Ladder
+from ihbench.run.cells import CellOutcome
 
 REGIONS = ("visible", "hidden", "never_seen")  # beside the headline
 PAPER = {"psnr": ("PSNR", 2), "ssim": ("SSIM", 4), "lpips": ("LPIPS*", 2)}

@@ -20,9 +20,9 @@ from ihbench.commands.scene_choice import SceneChoice
 from ihbench.errors import BadInput
 
 if TYPE_CHECKING:
-    from ihbench.ablation import Ladder
-    from ihbench.cells import Cell, CellOutcome
     from ihbench.clock.progress import Progress
+    from ihbench.run.ablation import Ladder
+    from ihbench.run.cells import Cell, CellOutcome
     from ihbench.scene.data_source import DataSource
 
 BETWEEN = ":"  # values of one switch
@@ -81,9 +81,9 @@ def ablated(
 ) -> tuple[str, dict[str, Any], list[CellOutcome]]:
     """Do the runs of a ladder, or of the grid `vary`, with `switches` on every rung: the table as Markdown and as
     numbers, and how each run ended. The options' own words for both are not read. Raises `BadInput`."""
-    from ihbench.cells import run_cells
     from ihbench.clock.machine import usable_cores
     from ihbench.record import outputs
+    from ihbench.run.cells import run_cells
 
     if not chosen.seed:
         raise BadInput("--seed: expected one number or more")
@@ -117,7 +117,7 @@ def write_out(chosen: AblateOptions, text: str, numbers: dict[str, Any]) -> None
 
 def profile_of(chosen: AblateOptions) -> Any:
     """The method's configuration under the profile. Raises `BadInput`."""
-    from ihbench.run_loop import configuration
+    from ihbench.run.run_loop import configuration
 
     return configuration(chosen.method, chosen.profile, {})
 
@@ -128,7 +128,7 @@ def _ladders(method: str) -> dict[str, Ladder]:
 
 
 def _ladder(chosen: AblateOptions, vary: Mapping[str, Sequence[Any]], switches: Mapping[str, Any]) -> Ladder:
-    from ihbench.ablation import grid, set_on_all
+    from ihbench.run.ablation import grid, set_on_all
 
     config = profile_of(chosen)
     if vary:
@@ -186,9 +186,9 @@ def _value(chosen: AblateOptions, config: Any, name: str, text: str) -> Any:
 
 def _cells(chosen: AblateOptions, ladder: Ladder, progress: Any) -> list[tuple[str, Cell]]:
     """Rung and cell of every run: seeds outermost, so that an early table holds every rung."""
-    from ihbench.ablation import configured, kept, shared_part
-    from ihbench.cells import Cell
-    from ihbench.run_loop import RunRequest
+    from ihbench.run.ablation import configured, kept, shared_part
+    from ihbench.run.cells import Cell
+    from ihbench.run.run_loop import RunRequest
     from ihbench.scene.data_source import locate
     from ihbench.scene.protocol import load_protocol
 

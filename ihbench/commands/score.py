@@ -79,8 +79,8 @@ def main(argv: list[str]) -> int:
 
 def scored(chosen: ScoreOptions, progress: Progress) -> list[RunResult]:
     """Score what the options name: a result for each scene. Says what is missing or doubtful. Raises `BadInput`."""
+    from ihbench.run.score_predictions import ScoreRequest, score_scene
     from ihbench.score.calibration import ROWS
-    from ihbench.score_predictions import ScoreRequest, score_scene
 
     source, prepared = _source(chosen)
     name = chosen.name or chosen.predictions.resolve().name

@@ -11,10 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ihbench import cells as cells_module
 from ihbench import registry
-from ihbench.ablation import Comparison, Ladder, Rung, configured, grid, kept, set_on_all, shared_part
-from ihbench.cells import Cell, run_cells
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.commands import ablate as ablate_command
@@ -25,11 +22,14 @@ from ihbench.files.atomic import read_json
 from ihbench.methods.inpainthuman.config import LEAST_TEXELS, PROFILES, QUICK
 from ihbench.record.results import read_result
 from ihbench.record.store import RunFolder
-from ihbench.run_loop import RunRequest, _planned
+from ihbench.run import cells as cells_module
+from ihbench.run.ablation import Comparison, Ladder, Rung, configured, grid, kept, set_on_all, shared_part
+from ihbench.run.cells import Cell, run_cells
+from ihbench.run.run_loop import RunRequest, _planned
+from ihbench.run.shared_states import lend, lender
 from ihbench.scene.data_source import DataSource
 from ihbench.scene.plan import SceneMeasure
 from ihbench.scene.protocol import load_protocol
-from ihbench.shared_states import lend, lender
 from tests.conftest import SCENES
 
 TINY = ["texels=32", "levels=16", "decoder_width=32", "position_map=16"]

@@ -21,7 +21,7 @@ from ihbench.files.atomic import read_json
 from ihbench.record.index import Index
 from ihbench.record.results import read_result
 from ihbench.record.store import KILLED, RunFolder
-from ihbench.recorded_run import RecordedRun, recorded
+from ihbench.run.recorded_run import RecordedRun, recorded
 from tests.bench.test_store import IDENTITY
 
 # a run that waits for its end, as `ihbench run` makes one
@@ -50,7 +50,7 @@ WORKERS = """\
 import sys
 from pathlib import Path
 from ihbench import cells
-from ihbench.cells import Cell, run_cells
+from ihbench.run.cells import Cell, run_cells
 from ihbench.clock.progress import Progress
 
 def child(connection, request, source, scene, threads):

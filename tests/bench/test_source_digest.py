@@ -19,9 +19,9 @@ from ihbench.files import atomic
 from ihbench.record import source_digest
 from ihbench.record.source_digest import bench_code, code_of, tree_digest
 from ihbench.record.store import RunFolder, identity_digest
+from ihbench.run.shared_states import lender
 from ihbench.scene.protocol import load_protocol
 from ihbench.score.calibration import Calibration
-from ihbench.shared_states import lender
 from tests.bench.test_house import imports
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -54,7 +54,7 @@ OF_THE_BENCH = [
     *("ihbench/metrics/ssim.py", "ihbench/metrics/flip_numba.py", "ihbench/metrics/presets.py"),
     *(
         "ihbench/score/scoring.py",
-        "ihbench/score_stage.py",
+        "ihbench/run/score_stage.py",
         "ihbench/score/calibration.py",
         "ihbench/score/predictions.py",
     ),
@@ -62,7 +62,7 @@ OF_THE_BENCH = [
         "ihbench/scene/plan.py",
         "ihbench/scene/protocol.py",
         "ihbench/camera.py",
-        "ihbench/run_loop.py",
+        "ihbench/run/run_loop.py",
         "ihbench/clock/ledger.py",
     ),
     *("protocols/occlusion.py", "datasets/zju_mocap.py", "datasets/capture_folder.py"),

@@ -268,7 +268,7 @@ def cut_short() -> Iterator[None]:
     import_all()  # a module imported inside would keep what stands here for good
 
     places = (
-        *("ihbench.run_loop.run_scene", "ihbench.cells.run_scene", "ihbench.metrics.oracles.check.check"),
+        *("ihbench.run.run_loop.run_scene", "ihbench.run.cells.run_scene", "ihbench.metrics.oracles.check.check"),
         *("ihbench.stress.run.run_cases", "ihbench.kernels.table.run_kernels", "ihbench.metrics.weights.fetch"),
         "ihbench.methods.inpainthuman.inpainting.paint_table.paint_scene",
         "ihbench.methods.inpainthuman.inpainting.crop_album.CropAlbum.make",

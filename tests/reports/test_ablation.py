@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from ihbench.ablation import Comparison, Ladder, Rung
 from ihbench.reports.ablation import write
+from ihbench.run.ablation import Comparison, Ladder, Rung
 from tests.reports.made_up_runs import made_up
 
 SCENES = tuple("abcdef")

@@ -12,7 +12,8 @@ from ihbench.record.provenance import command
 from ihbench.record.results import RunResult, read_result
 from ihbench.record.source_digest import bench_code
 from ihbench.record.store import RunFolder, RunIdentity
-from ihbench.recorded_run import RecordedRun, about_scene, recorded
+from ihbench.run.recorded_run import RecordedRun, about_scene, recorded
+from ihbench.run.score_stage import ScoreStage
 from ihbench.scene.capture_digest import capture_digest
 from ihbench.scene.data_source import DataSource
 from ihbench.scene.protocol import Protocol
@@ -20,7 +21,6 @@ from ihbench.scene.views import OccludedScene, open_scene
 from ihbench.score.prediction_doubts import Doubts
 from ihbench.score.predictions import Predictions, find_alpha, find_predictions
 from ihbench.score.scoring import Scorer
-from ihbench.score_stage import ScoreStage
 from ihbench.version import __version__
 
 if TYPE_CHECKING:

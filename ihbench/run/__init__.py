@@ -1,0 +1,1 @@
+"""The run loop: stages, resume, several runs side by side, sweeps."""
