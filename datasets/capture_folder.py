@@ -19,7 +19,7 @@ BY_OPTIONS = "(--train-frames, --test-frames)"  # how a frame of a fixed recordi
 
 
 class CaptureFolder(ABC):
-    """One subject's folder. A format adds what `ihbench.scene.contracts.Capture` asks for."""
+    """One subject's folder. A format adds what `scene.contracts.Capture` asks for."""
 
     n_frames: int
     camera_ids: tuple[str, ...]

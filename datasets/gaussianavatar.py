@@ -88,7 +88,7 @@ class Stored:
 
 
 class GaussianAvatarCapture(SnapshotFolder):
-    """One subject, read lazily; see `ihbench.scene.contracts.Capture`. Keeps no images.
+    """One subject, read lazily; see `scene.contracts.Capture`. Keeps no images.
 
     Frames are numbered as the images are named when all names are numbers and none occurs twice, else consecutively:
     those of train, then those of test. `frames` lists the numbers that exist, `split_of` says where they lie.

@@ -79,7 +79,7 @@ def _folders(root: Path) -> list[Path]:
 
 
 class HumanNerfCapture(CaptureFolder):
-    """One subject, read lazily; see `ihbench.scene.contracts.Capture`. Keeps no images.
+    """One subject, read lazily; see `scene.contracts.Capture`. Keeps no images.
 
     A frame is the number in the names; a frame without a file is missing, and said so when it is read.
     """

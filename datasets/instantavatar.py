@@ -87,7 +87,7 @@ class InstantAvatar:
 
 
 class InstantAvatarCapture(SnapshotFolder):
-    """One subject, read lazily; see `ihbench.scene.contracts.Capture`. Keeps no images.
+    """One subject, read lazily; see `scene.contracts.Capture`. Keeps no images.
 
     There are as many frames as poses; images that real data lack at the end shorten it.
     """

@@ -195,7 +195,7 @@ class OcMotionOriginal:
 
 
 class OcMotionCapture(OneCameraCapture):
-    """One person before one camera of the original release, read lazily; see `ihbench.scene.contracts.Capture`.
+    """One person before one camera of the original release, read lazily; see `scene.contracts.Capture`.
 
     Its frames are those that annotate the person, in the order of the annotations.
     """

@@ -93,7 +93,7 @@ class OcMotionW2a:
 
 
 class W2aCapture(OneCameraCapture):
-    """One sequence, read lazily; see `ihbench.scene.contracts.Capture`. `frame_names[k]` is the stem of frame k's files.
+    """One sequence, read lazily; see `scene.contracts.Capture`. `frame_names[k]` is the stem of frame k's files.
 
     Frames are the sorted images, as OccFusion counts them; for a stand-in, which may lack images, those of
     metadata.json.

@@ -113,7 +113,7 @@ class SnapshotFolder(CaptureFolder):
 
 
 class PeopleSnapshotCapture(SnapshotFolder):
-    """One subject, read lazily; see `ihbench.scene.contracts.Capture`. Keeps the last few decoded frames."""
+    """One subject, read lazily; see `scene.contracts.Capture`. Keeps the last few decoded frames."""
 
     def __init__(self, folder: Path, body: Body | None = None):
         super().__init__(folder, folder.name, body)

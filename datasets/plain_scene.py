@@ -102,7 +102,7 @@ class PlainScene:
 
 
 class PlainCapture(CaptureFolder):
-    """One scene, read lazily; see `ihbench.scene.contracts.Capture`.
+    """One scene, read lazily; see `scene.contracts.Capture`.
 
     Frames are the rows of poses.npz by frame number, but for rows whose number no image has (`without_image`).
     """

@@ -90,7 +90,7 @@ class ZjuMocap:
 
 
 class ZjuCapture(CaptureFolder):
-    """One subject, read lazily; see `ihbench.scene.contracts.Capture`. Keeps no images."""
+    """One subject, read lazily; see `scene.contracts.Capture`. Keeps no images."""
 
     dataset = "zju_mocap"
     layout, prefix = "original", FOLDER_PREFIX

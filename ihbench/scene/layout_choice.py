@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class LayoutChoice:
-    """A registered data set: called with a folder it opens the layout that is there; see `ihbench.scene.contracts.Dataset`."""
+    """A registered data set: called with a folder it opens the layout there; see `scene.contracts.Dataset`."""
 
     name: str
     layouts: tuple[str, ...]  # "module:class" of each, in the order in which they are tried

@@ -85,7 +85,7 @@ def untouched(_camera: int, _frame: int, pixels: NDArray) -> NDArray:
 
 @dataclass(eq=False)
 class DrawnCapture:
-    """`ihbench.scene.contracts.Capture` of some poses seen by some cameras; `edit_*` change pixels as they are read."""
+    """`scene.contracts.Capture` of some poses seen by some cameras; `edit_*` change pixels as they are read."""
 
     poses: Sequence[BodyPose]
     cameras: Sequence[Camera]

@@ -183,7 +183,7 @@ class GaussianAvatar(nn.Module):
     def render(
         self, camera: Camera, body_pose: BodyPose, background: tuple[float, float, float] = (1.0, 1.0, 1.0)
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """rgb [H, W, 3] on `background` and alpha [H, W]; see `ihbench.scene.contracts.Avatar`.
+        """rgb [H, W, 3] on `background` and alpha [H, W]; see `scene.contracts.Avatar`.
 
         Draws every point: where the first surface has a gap, what is behind it is nearer to the truth than the
         background.

@@ -25,7 +25,7 @@ class InpaintHuman:
     def fit(
         self, training: TrainingSet, *, device: str, seed: int, ledger: Ledger, progress: Progress
     ) -> GaussianAvatar:
-        """Fit one person. See `ihbench.scene.contracts.Method`. Raises `BadInput` without a view that shows the person."""
+        """Fit one person. See `scene.contracts.Method`. Raises `BadInput` without a view that shows the person."""
         if not len(training.views):
             raise BadInput(f"scene {training.name}: no training view; nothing to fit")
         inpaint = self.config.inpaint

@@ -53,7 +53,8 @@ def test_a_full_disk_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch,
 
 def test_a_real_limit_on_file_size(tmp_path):
     code = (
-        "import resource, signal, sys; from pathlib import Path; from ihbench import atomic, errors\n"
+        "import resource, signal, sys; from pathlib import Path\n"
+        "from ihbench import errors; from ihbench.files import atomic\n"
         "path = Path(sys.argv[1]); atomic.write_bytes(path, b'old')\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN); resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"
         "try: atomic.write_bytes(path, bytes(100_000))\n"
@@ -71,7 +72,7 @@ def test_killed_while_writing_leaves_the_old_file(tmp_path):
     path = tmp_path / "f"
     path.write_text("old")
     code = (
-        "import os, signal, sys; from pathlib import Path; from ihbench import atomic\n"
+        "import os, signal, sys; from pathlib import Path; from ihbench.files import atomic\n"
         "os.fsync = lambda descriptor: os.kill(os.getpid(), signal.SIGKILL)\n"
         "atomic.write_text(Path(sys.argv[1]), 'new')"
     )
@@ -106,7 +107,7 @@ def test_a_folder_or_a_file_in_the_way_is_bad_input(tmp_path):
 def write_through(path: str, to: object) -> subprocess.CompletedProcess:
     """`write_text` in a process of its own, with prints before and after, as a command has them."""
     code = (
-        "import sys; from pathlib import Path; from ihbench import atomic\n"
+        "import sys; from pathlib import Path; from ihbench.files import atomic\n"
         "print('before'); atomic.write_text(Path(sys.argv[1]), 'written\\n'); print('after')"
     )
     return subprocess.run([sys.executable, "-c", code, path], stdout=to, stderr=subprocess.PIPE, text=True)  # pyright: ignore

@@ -175,7 +175,7 @@ def test_processes_that_write_the_index_at_once_do_not_mind(tmp_path):
     for seed in range(4):
         finished(tmp_path, seed=seed)
     code = (
-        "import sys; from pathlib import Path; from ihbench import index; index.FRESH = 10**12\n"
+        "import sys; from pathlib import Path; from ihbench.record import index; index.FRESH = 10**12\n"
         "for _ in range(20): assert len(index.Index(Path(sys.argv[1])).results()[0]) == 4"
     )
     rivals = [subprocess.Popen([sys.executable, "-c", code, str(tmp_path)]) for _ in range(3)]

@@ -28,7 +28,7 @@ from tests.bench.test_store import IDENTITY
 WAITS = """\
 import sys, time
 from pathlib import Path
-from ihbench import cli, recorded_run
+from ihbench import cli; from ihbench.run import recorded_run
 from tests.bench.test_store import IDENTITY
 
 class Waits(recorded_run.RecordedRun):
@@ -49,7 +49,7 @@ sys.exit(cli.main(["run"]))
 WORKERS = """\
 import sys
 from pathlib import Path
-from ihbench import cells
+from ihbench.run import cells
 from ihbench.run.cells import Cell, run_cells
 from ihbench.clock.progress import Progress
 

@@ -34,13 +34,13 @@ def test_the_load_of_the_beginning_is_kept_beside_that_of_the_end():
 
 
 def test_a_cpu_has_nothing_to_warm_up_and_torch_is_not_brought_for_it():
-    code = "import sys; from ihbench import machine; machine.warm_up('cpu'); assert 'torch' not in sys.modules"
+    code = "import sys; from ihbench.clock import machine; machine.warm_up('cpu'); assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_identity_does_not_import_torch():
     code = (
-        "import sys; from ihbench import machine; facts = machine.identity(); machine.synchronize('cuda')\n"
+        "import sys; from ihbench.clock import machine; facts = machine.identity(); machine.synchronize('cuda')\n"
         "assert machine.peak_device_memory_mb() == 0 and facts['torch'] is None and 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

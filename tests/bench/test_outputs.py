@@ -34,7 +34,7 @@ def test_a_file_is_written_again_until_somebody_edits_it(tmp_path):
 
 def test_two_commands_in_one_folder_lose_nothing_of_each_others_list(tmp_path):
     code = (
-        "import sys; from pathlib import Path; from ihbench import outputs\n"
+        "import sys; from pathlib import Path; from ihbench.record import outputs\n"
         "for k in range(40): outputs.write_text(Path(sys.argv[1], f'{sys.argv[2]}-{k}'), sys.argv[2])"
     )
     both = [subprocess.Popen([sys.executable, "-c", code, str(tmp_path), name]) for name in ("a", "b")]
