@@ -7,23 +7,24 @@ from ihbench.scene.layout_choice import LayoutChoice
 ZJU_MOCAP = LayoutChoice(
     "zju_mocap",
     (
-        "ihbench.datasets.zju_mocap:ZjuMocap",
-        "ihbench.datasets.zju_refine:ZjuRefine",
-        "ihbench.datasets.humannerf:HumanNerfFormat",
+        "ihbench.datasets.zju_mocap.original:ZjuMocap",
+        "ihbench.datasets.zju_mocap.refine:ZjuRefine",
+        "ihbench.datasets.zju_mocap.humannerf:HumanNerfFormat",
     ),
 )
 PEOPLE_SNAPSHOT = LayoutChoice(
     "people_snapshot",
     (
-        "ihbench.datasets.people_snapshot:PeopleSnapshotRaw",
-        "ihbench.datasets.instantavatar:InstantAvatar",
-        "ihbench.datasets.gaussianavatar:GaussianAvatar",
+        "ihbench.datasets.people_snapshot.original:PeopleSnapshotRaw",
+        "ihbench.datasets.people_snapshot.instantavatar:InstantAvatar",
+        "ihbench.datasets.people_snapshot.gaussianavatar:GaussianAvatar",
     ),
 )
 OCMOTION = LayoutChoice(
     "ocmotion",
     (
-        "ihbench.datasets.ocmotion_w2a:OcMotionW2a",
-        "ihbench.datasets.ocmotion:OcMotionOriginal",
+        "ihbench.datasets.ocmotion.wild2avatar:OcMotionW2a",
+        "ihbench.datasets.ocmotion.original:OcMotionOriginal",
     ),
 )
+PLAIN = LayoutChoice("custom", ("ihbench.datasets.plain.plain_scene:PlainScene",))

@@ -11,7 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from ihbench.data.prepare import Handout
-from ihbench.datasets import gaussianavatar, humannerf, instantavatar, ocmotion_w2a, zju_mocap, zju_refine
+from ihbench.datasets.ocmotion import wild2avatar as ocmotion_w2a
+from ihbench.datasets.people_snapshot import gaussianavatar, instantavatar
+from ihbench.datasets.zju_mocap import humannerf
+from ihbench.datasets.zju_mocap import original as zju_mocap
+from ihbench.datasets.zju_mocap import refine as zju_refine
 from ihbench.files import atomic
 from ihbench.files.pictures import encoded
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from ihbench.body import Body, load_body
 from ihbench.clock.progress import Progress
+from ihbench.datasets.reading.standin_mark import STANDIN_FILE
 from ihbench.datasets.standin.subject import Subject
-from ihbench.datasets.standin_mark import STANDIN_FILE
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.locks import locked

@@ -16,7 +16,7 @@ import numpy as np
 
 from ihbench.camera import Camera, look_at
 from ihbench.clock.progress import Progress
-from ihbench.datasets import ocmotion_w2a
+from ihbench.datasets.ocmotion import wild2avatar as ocmotion_w2a
 from ihbench.datasets.standin import motion
 from ihbench.datasets.standin.cast import alone_with, cast_names, open_cast
 from ihbench.datasets.standin.furniture import furnish, furniture_view

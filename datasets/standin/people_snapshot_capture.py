@@ -18,7 +18,7 @@ from ihbench.body.pose import BodyPose
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera, look_at
 from ihbench.clock.progress import Progress
-from ihbench.datasets import people_snapshot
+from ihbench.datasets.people_snapshot import original as people_snapshot
 from ihbench.datasets.standin import motion
 from ihbench.datasets.standin.cast import alone_with, cast_names, open_cast
 from ihbench.datasets.standin.photograph import Photograph, photograph

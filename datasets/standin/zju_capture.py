@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.clock.progress import Progress
-from ihbench.datasets import zju_mocap
 from ihbench.datasets.standin.cast import alone_with, cast_names, open_cast
 from ihbench.datasets.standin.motion import N_FRAMES, NOVEL_FRAMES
 from ihbench.datasets.standin.photograph import photograph
 from ihbench.datasets.standin.rig import N_CAMERAS
 from ihbench.datasets.standin.studio import empty_studio
 from ihbench.datasets.standin.subject import Subject
+from ihbench.datasets.zju_mocap import original as zju_mocap
 from ihbench.errors import BadInput
 
 VERSION = 2  # of the generator; a change that moves a pixel raises it

@@ -10,7 +10,7 @@ import pytest
 from ihbench.body import load_body
 from ihbench.cli import main
 from ihbench.clock.progress import Progress
-from ihbench.datasets import plain_scene
+from ihbench.datasets.plain import plain_scene
 from ihbench.errors import BadInput
 from ihbench.files.images import write_png
 from ihbench.record.results import read_result
@@ -212,8 +212,8 @@ def test_a_folder_of_body_files_has_one_for_each_gender(tmp_path, files, gender,
 
 def test_a_large_capture_opens_without_decoding_an_image(tmp_path, monkeypatch):
     """646 frames of 23 cameras: headers only, whatever the number of images."""
-    from ihbench.datasets import zju_mocap
     from ihbench.datasets.layouts import ZJU_MOCAP
+    from ihbench.datasets.zju_mocap import original as zju_mocap
     from ihbench.files import pictures
 
     folder = tmp_path / "CoreView_386"

@@ -10,7 +10,7 @@ from PIL import Image
 
 from ihbench import registry
 from ihbench.camera import distort
-from ihbench.datasets import plain_scene
+from ihbench.datasets.plain import plain_scene
 from ihbench.errors import BadInput
 from ihbench.metrics.identity import METRICS
 from ihbench.scene.contracts import MaskState

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from ihbench.datasets.plain_scene import PlainScene
-from ihbench.datasets.zju_mocap import ZjuMocap
+from ihbench.datasets.plain.plain_scene import PlainScene
+from ihbench.datasets.zju_mocap.original import ZjuMocap
 from ihbench.errors import BadInput
 from ihbench.files.paths import user_path
 

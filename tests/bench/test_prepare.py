@@ -107,7 +107,7 @@ def test_what_is_there_is_kept_and_nothing_half_written(scene, tmp_path, monkeyp
     with pytest.raises(BadInput, match="is there already"):
         handed(scene, tmp_path, "humannerf")
     before = files_of(tmp_path)
-    from ihbench.datasets import humannerf
+    from ihbench.datasets.zju_mocap import humannerf
 
     def fail(*_):
         raise OSError(28, "No space left on device")

@@ -65,7 +65,7 @@ OF_THE_BENCH = [
         "ihbench/run/run_loop.py",
         "ihbench/clock/ledger.py",
     ),
-    *("protocols/occlusion.py", "datasets/zju_mocap.py", "datasets/capture_folder.py"),
+    *("protocols/occlusion.py", "datasets/zju_mocap/original.py", "datasets/reading/capture_folder.py"),
 ]
 OF_THE_METHOD = ["methods/inpainthuman/stage1.py", "methods/inpainthuman/inpainting/sampling.py"]
 OF_NO_NUMBER = [

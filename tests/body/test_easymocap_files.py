@@ -12,7 +12,7 @@ from ihbench.body import load_body
 from ihbench.body.easymocap_files import easymocap_cameras, easymocap_poses
 from ihbench.body.pose_estimators import from_easymocap
 from ihbench.camera import Camera
-from ihbench.datasets import plain_scene
+from ihbench.datasets.plain import plain_scene
 from ihbench.errors import BadInput
 
 NAMES = ["1", "02", "left"]

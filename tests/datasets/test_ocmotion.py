@@ -18,9 +18,10 @@ from scipy.spatial.transform import Rotation
 from ihbench.body import load_body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera, look_at
-from ihbench.datasets import ocmotion, ocmotion_w2a
-from ihbench.datasets.ocmotion import AnnotFrame, AnnotPerson, OcMotionOriginal
-from ihbench.datasets.ocmotion_w2a import OcMotionW2a
+from ihbench.datasets.ocmotion import original as ocmotion
+from ihbench.datasets.ocmotion import wild2avatar as ocmotion_w2a
+from ihbench.datasets.ocmotion.original import AnnotFrame, AnnotPerson, OcMotionOriginal
+from ihbench.datasets.ocmotion.wild2avatar import OcMotionW2a
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.render.zbuffer import rasterize

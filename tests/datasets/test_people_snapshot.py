@@ -20,10 +20,11 @@ from scipy.ndimage import binary_closing
 from ihbench.body import load_body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
-from ihbench.datasets import gaussianavatar, instantavatar, people_snapshot
-from ihbench.datasets.gaussianavatar import GaussianAvatar
-from ihbench.datasets.instantavatar import InstantAvatar
-from ihbench.datasets.people_snapshot import PeopleSnapshotRaw
+from ihbench.datasets.people_snapshot import gaussianavatar, instantavatar
+from ihbench.datasets.people_snapshot import original as people_snapshot
+from ihbench.datasets.people_snapshot.gaussianavatar import GaussianAvatar
+from ihbench.datasets.people_snapshot.instantavatar import InstantAvatar
+from ihbench.datasets.people_snapshot.original import PeopleSnapshotRaw
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 

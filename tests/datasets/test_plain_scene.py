@@ -20,8 +20,8 @@ from ihbench.body.pose import BodyPose
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera, look_at
 from ihbench.commands import data
-from ihbench.datasets import plain_scene
-from ihbench.datasets.plain_scene import PlainScene, read_cameras, read_poses
+from ihbench.datasets.plain import plain_scene
+from ihbench.datasets.plain.plain_scene import PlainScene, read_cameras, read_poses
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.render.zbuffer import rasterize

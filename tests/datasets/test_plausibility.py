@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from ihbench.body import load_body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
-from ihbench.datasets import plain_scene
-from ihbench.datasets.plausibility import absurd_camera, suspicious_camera
+from ihbench.datasets.plain import plain_scene
+from ihbench.datasets.reading.plausibility import absurd_camera, suspicious_camera
 from ihbench.render.zbuffer import rasterize
 
 WIDTH, HEIGHT, FRAMES = 96, 128, 14

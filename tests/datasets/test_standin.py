@@ -19,7 +19,7 @@ from ihbench.datasets.standin.rig import camera_ring
 from ihbench.datasets.standin.studio import empty_studio
 from ihbench.datasets.standin.subject import Subject
 from ihbench.datasets.standin.zju_capture import ZjuStandIn
-from ihbench.datasets.zju_mocap import ZjuMocap
+from ihbench.datasets.zju_mocap.original import ZjuMocap
 from ihbench.errors import BadInput
 from ihbench.render.zbuffer import rasterize, vertex_normals
 

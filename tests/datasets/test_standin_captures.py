@@ -14,9 +14,9 @@ import pytest
 from PIL import Image
 
 from ihbench.cli import main
-from ihbench.datasets import people_snapshot
 from ihbench.datasets.layouts import OCMOTION, PEOPLE_SNAPSHOT
-from ihbench.datasets.pickles import write_pickle
+from ihbench.datasets.people_snapshot import original as people_snapshot
+from ihbench.datasets.reading.pickles import write_pickle
 from ihbench.datasets.standin import ocmotion_capture, people_snapshot_capture
 from ihbench.datasets.standin.ocmotion_capture import OcMotionStandIn
 from ihbench.datasets.standin.people_snapshot_capture import PeopleSnapshotStandIn

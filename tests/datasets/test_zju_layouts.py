@@ -10,10 +10,12 @@ import pytest
 from ihbench.body import load_body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera, look_at
-from ihbench.datasets import humannerf, zju_mocap, zju_refine
-from ihbench.datasets.humannerf import HumanNerfFormat, betas_of_joints
 from ihbench.datasets.layouts import ZJU_MOCAP
-from ihbench.datasets.zju_refine import ZjuRefine
+from ihbench.datasets.zju_mocap import humannerf
+from ihbench.datasets.zju_mocap import original as zju_mocap
+from ihbench.datasets.zju_mocap import refine as zju_refine
+from ihbench.datasets.zju_mocap.humannerf import HumanNerfFormat, betas_of_joints
+from ihbench.datasets.zju_mocap.refine import ZjuRefine
 from ihbench.errors import BadInput
 
 WIDTH, HEIGHT, N_FRAMES = 64, 48, 3

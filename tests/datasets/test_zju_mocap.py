@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from ihbench.body import load_body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera, look_at
-from ihbench.datasets import zju_mocap
-from ihbench.datasets.zju_mocap import ZjuMocap
+from ihbench.datasets.zju_mocap import original as zju_mocap
+from ihbench.datasets.zju_mocap.original import ZjuMocap
 from ihbench.errors import BadInput
 
 WIDTH, HEIGHT = 64, 48

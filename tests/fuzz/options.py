@@ -27,7 +27,7 @@ import tyro
 
 from ihbench import registry
 from ihbench.cli import COMMANDS, main
-from ihbench.datasets import plain_scene
+from ihbench.datasets.plain import plain_scene
 from ihbench.errors import BadInput
 from ihbench.stress.drawn_capture import a_camera, a_pose, the_body
 from tests.fuzz.patience import TooLong, at_most

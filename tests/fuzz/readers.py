@@ -22,10 +22,13 @@ from ihbench.body.pose import BodyPose
 from ihbench.body.smpl_file import read_arrays, write_body
 from ihbench.body.uv_obj import read_uv_obj
 from ihbench.clock.ledger import Ledger
-from ihbench.datasets import gaussianavatar, instantavatar, ocmotion_w2a, people_snapshot, plain_scene
-from ihbench.datasets import zju_mocap as zju
-from ihbench.datasets.pickles import write_pickle
-from ihbench.datasets.standin_mark import STANDIN_FILE, standin_mark
+from ihbench.datasets.ocmotion import wild2avatar as ocmotion_w2a
+from ihbench.datasets.people_snapshot import gaussianavatar, instantavatar
+from ihbench.datasets.people_snapshot import original as people_snapshot
+from ihbench.datasets.plain import plain_scene
+from ihbench.datasets.reading.pickles import write_pickle
+from ihbench.datasets.reading.standin_mark import STANDIN_FILE, standin_mark
+from ihbench.datasets.zju_mocap import original as zju
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.images import read_image

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ihbench.body import Body, load_body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
-from ihbench.datasets.standin_mark import standin_mark
+from ihbench.datasets.reading.standin_mark import standin_mark
 from ihbench.errors import BadInput
 
 BY_OPTIONS = "(--train-frames, --test-frames)"  # how a frame of a fixed recording is left out

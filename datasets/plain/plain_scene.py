@@ -30,9 +30,9 @@ from ihbench.body.pose import BodyPose
 from ihbench.body.skeleton import pose_hint
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera, off_orthogonal
-from ihbench.datasets.capture_folder import CaptureFolder
-from ihbench.datasets.plausibility import SOFT_VALUES, Outline, examine
-from ihbench.datasets.standin_mark import STANDIN_FILE
+from ihbench.datasets.reading.capture_folder import CaptureFolder
+from ihbench.datasets.reading.plausibility import SOFT_VALUES, Outline, examine
+from ihbench.datasets.reading.standin_mark import STANDIN_FILE
 from ihbench.errors import BadInput, BadValue
 from ihbench.files import atomic
 from ihbench.files.npz import read_npz

@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from ihbench.body import Body, from_zju_root, zju_root
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
-from ihbench.datasets.capture_folder import CaptureFolder
-from ihbench.datasets.pickles import write_pickle
-from ihbench.datasets.plausibility import Outline, examine
+from ihbench.datasets.reading.capture_folder import CaptureFolder
+from ihbench.datasets.reading.pickles import write_pickle
+from ihbench.datasets.reading.plausibility import Outline, examine
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.paths import user_path

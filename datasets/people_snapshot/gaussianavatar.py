@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from ihbench.body import Body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
-from ihbench.datasets.people_snapshot import (
+from ihbench.datasets.people_snapshot.original import (
     SnapshotFolder,
     checked,
     chosen_folder,

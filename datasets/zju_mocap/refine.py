@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.body import Body
-from ihbench.datasets import zju_mocap
-from ihbench.datasets.zju_mocap import ZjuCapture, ZjuMocap
+from ihbench.datasets.zju_mocap import original as zju_mocap
+from ihbench.datasets.zju_mocap.original import ZjuCapture, ZjuMocap
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.pictures import encoded

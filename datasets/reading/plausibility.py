@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
-from ihbench.datasets.capture_folder import CaptureFolder
+from ihbench.datasets.reading.capture_folder import CaptureFolder
 from ihbench.errors import BadInput
 from ihbench.files.pictures import read_picture
 

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from ihbench.body import Body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
-from ihbench.datasets.ocmotion import (
+from ihbench.datasets.ocmotion.original import (
     OneCameraCapture,
     check_calibration,
     checked,
@@ -39,7 +39,7 @@ from ihbench.datasets.ocmotion import (
     stored_camera,
     ten_betas,
 )
-from ihbench.datasets.pickles import write_pickle
+from ihbench.datasets.reading.pickles import write_pickle
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.paths import user_path
@@ -277,7 +277,7 @@ def _where_else(root: Path) -> str:
 
 
 def check(root: Path, body: Body | None = None, samples: int = 3) -> dict[str, Any]:
-    """What this copy is and what it lacks, for `ihbench data check`; see `ihbench.datasets.ocmotion.checked`.
+    """What this copy is and what it lacks, for `ihbench data check`; see `ihbench.datasets.ocmotion.original.checked`.
 
     Entries of metadata.json outside the range of the images are counted in missing["image"], too. Raises `BadInput`
     when the root is not of this layout at all.

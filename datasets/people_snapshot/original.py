@@ -32,9 +32,9 @@ from ihbench.body import Body
 from ihbench.body.pose import BodyPose
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera, off_orthogonal
-from ihbench.datasets.capture_folder import BY_OPTIONS, CaptureFolder
-from ihbench.datasets.pickles import write_pickle
-from ihbench.datasets.plausibility import Outline, examine, share_inside
+from ihbench.datasets.reading.capture_folder import BY_OPTIONS, CaptureFolder
+from ihbench.datasets.reading.pickles import write_pickle
+from ihbench.datasets.reading.plausibility import Outline, examine, share_inside
 from ihbench.errors import BadInput
 from ihbench.files import atomic, npz
 from ihbench.files.paths import user_path

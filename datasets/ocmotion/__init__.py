@@ -1,0 +1,1 @@
+"""OcMotion: its original layout, and Wild2Avatar's."""

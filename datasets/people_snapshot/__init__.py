@@ -1,0 +1,1 @@
+"""PeopleSnapshot: its original layout, InstantAvatar's and GaussianAvatar's."""

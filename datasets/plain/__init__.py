@@ -1,0 +1,1 @@
+"""A plain folder: images, masks, cameras and poses of anybody's video."""

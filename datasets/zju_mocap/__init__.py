@@ -1,0 +1,1 @@
+"""ZJU-MoCap: its original layout, the refined poses, HumanNeRF's folders."""
