@@ -277,7 +277,7 @@ def _where_else(root: Path) -> str:
 
 
 def check(root: Path, body: Body | None = None, samples: int = 3) -> dict[str, Any]:
-    """What this copy is and what it lacks, for `ihbench data check`; see `ihbench.datasets.ocmotion.original.checked`.
+    """What this copy is and what it lacks, for `ihbench data check`; see `original.checked`.
 
     Entries of metadata.json outside the range of the images are counted in missing["image"], too. Raises `BadInput`
     when the root is not of this layout at all.

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from ihbench.bounds import STEPS, MultipleOf, Within, check
+from ihbench.diffusion.inpaint_config import PAPER_INPAINT, QUICK_INPAINT, InpaintConfig
 from ihbench.errors import BadInput
-from ihbench.methods.inpainthuman.inpainting.inpaint_config import PAPER_INPAINT, QUICK_INPAINT, InpaintConfig
 from ihbench.methods.inpainthuman.refine_config import PAPER_REFINE, QUICK_REFINE, RefineConfig
 from ihbench.metrics.weights import FILES, locate
 from ihbench.scene.plan import Omission, SceneMeasure
@@ -235,7 +235,7 @@ def _trunk(refine: RefineConfig) -> Path | None:
 
 def _folder(name: str) -> Path | None:
     """A folder, or the cached snapshot of a hub id; None for what the run will complain of by itself."""
-    from ihbench.methods.inpainthuman.inpainting.checkpoint import find_folder
+    from ihbench.diffusion.checkpoint import find_folder
 
     try:
         return find_folder(name, "")

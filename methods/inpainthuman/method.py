@@ -31,11 +31,11 @@ class InpaintHuman:
         inpaint = self.config.inpaint
         with ledger.stage("fit/prepare"):
             if self.config.paints and inpaint.uses_diffusion and inpaint.names_something:
-                from ihbench.methods.inpainthuman.inpainting.diffusion_inpainter import check_backbone
+                from ihbench.diffusion.diffusion_inpainter import check_backbone
 
                 check_backbone(inpaint)
             if self.config.paints and inpaint.silhouette == "sam":
-                from ihbench.methods.inpainthuman.inpainting.complete_silhouette import check_sam
+                from ihbench.diffusion.complete_silhouette import check_sam
 
                 check_sam(inpaint.sam_weights)
             betas = np.mean([view.body_pose.betas for view in training.views], axis=0)

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
+from ihbench.diffusion.crops.crop_view import CropView, Inpainter, cut_view, with_frames
+from ihbench.diffusion.inpaint_config import InpaintConfig
 from ihbench.methods.inpainthuman.avatar import GaussianAvatar
-from ihbench.methods.inpainthuman.inpainting.crop_view import CropView, Inpainter, cut_view, with_frames
-from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
 from ihbench.methods.inpainthuman.inpainting.painted_view import PaintedView, paste_back
 from ihbench.methods.inpainthuman.inpainting.shown_view import turntable_view, with_known_surface
 from ihbench.methods.inpainthuman.inpainting.surface_need import SeenSurface, key_views, seen_surface
@@ -105,14 +105,14 @@ class Stage2:
 
             simple: Inpainter = fillers(self.training.body, self.training.background)[config.filler]
             return simple, SIMPLE_SIZE, False
-        from ihbench.methods.inpainthuman.inpainting.diffusion_inpainter import DiffusionInpainter, load_backbone
+        from ihbench.diffusion.diffusion_inpainter import DiffusionInpainter, load_backbone
 
         with self.ledger.stage("load"):
             backbone = load_backbone(config, str(self.avatar.device))
         return DiffusionInpainter(backbone, config, self.seed, self.ledger), backbone.size, backbone.square
 
     def _silhouettes(self) -> Any:
-        from ihbench.methods.inpainthuman.inpainting.complete_silhouette import silhouette_finder
+        from ihbench.diffusion.complete_silhouette import silhouette_finder
 
         device = str(self.avatar.device)
         return silhouette_finder(self.config.silhouette, self.training.background, self.config.sam_weights, device)

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench.methods.inpainthuman.inpainting.crop_view import CropView, cut_view
+from ihbench.diffusion.crops.crop_view import CropView, cut_view
 from ihbench.scene.contracts import MaskState, TrainView
 from tests.bench.fake_capture import WHITE, a_camera, a_pose, rasterized, the_body, train_view, vertex_colors
 

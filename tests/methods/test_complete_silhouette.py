@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 from ihbench.clock.threads import one_torch_thread
-from ihbench.errors import BadInput
-from ihbench.methods.inpainthuman.inpainting import complete_silhouette as module
-from ihbench.methods.inpainthuman.inpainting.complete_silhouette import (
+from ihbench.diffusion import complete_silhouette as module
+from ihbench.diffusion.complete_silhouette import (
     CoverageSilhouette,
     GrabCutSilhouette,
     SamSilhouette,
     silhouette_finder,
     silhouette_iou,
 )
-from ihbench.methods.inpainthuman.inpainting.crop_view import CropView, cut_view
-from ihbench.methods.inpainthuman.inpainting.part_map import NO_PART
+from ihbench.diffusion.crops.crop_view import CropView, cut_view
+from ihbench.diffusion.crops.part_map import NO_PART
+from ihbench.errors import BadInput
 from tests.bench.fake_capture import WHITE, a_camera, a_pose, the_body, train_view
 
 FINDERS = [CoverageSilhouette(WHITE), GrabCutSilhouette(WHITE)]

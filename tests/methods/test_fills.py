@@ -9,10 +9,10 @@ import pytest
 from ihbench.body import texel_table
 from ihbench.clock.progress import Progress
 from ihbench.clock.threads import one_torch_thread
+from ihbench.diffusion.crops.part_map import smpl_parts
+from ihbench.diffusion.inpaint_config import Filler
 from ihbench.methods.inpainthuman.inpainting.colour_fills import GREY, MeanColour, NavierStokes, Telea
 from ihbench.methods.inpainthuman.inpainting.fillers import fillers
-from ihbench.methods.inpainthuman.inpainting.inpaint_config import Filler
-from ihbench.methods.inpainthuman.inpainting.part_map import smpl_parts
 from ihbench.methods.inpainthuman.inpainting.surface_colours import faced_texels, off_the_rim, pixel_texels
 from ihbench.methods.inpainthuman.inpainting.texture_fills import (
     MirroredTexture,

@@ -11,9 +11,8 @@ import torch
 from ihbench.body import load_body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera, look_at
-from ihbench.methods.inpainthuman.inpainting.block_transform import BlockTransform
-from ihbench.methods.inpainthuman.inpainting.crop_view import cut_view
-from ihbench.methods.inpainthuman.inpainting.part_map import (
+from ihbench.diffusion.crops.crop_view import cut_view
+from ihbench.diffusion.crops.part_map import (
     BACK,
     NO_PART,
     palette,
@@ -21,9 +20,10 @@ from ihbench.methods.inpainthuman.inpainting.part_map import (
     part_labels,
     smpl_parts,
 )
-from ihbench.methods.inpainthuman.inpainting.person_crop import PersonCrop, person_crop
-from ihbench.methods.inpainthuman.inpainting.push_pull import push_pull
-from ihbench.methods.inpainthuman.inpainting.random_mask import KINDS, random_mask
+from ihbench.diffusion.crops.person_crop import PersonCrop, person_crop
+from ihbench.diffusion.crops.push_pull import push_pull
+from ihbench.diffusion.crops.random_mask import KINDS, random_mask
+from ihbench.diffusion.mini.block_transform import BlockTransform
 from ihbench.scene.contracts import MaskState, TrainView
 
 STANDING = BodyPose(np.zeros((24, 3)), np.zeros(10), np.zeros(3))

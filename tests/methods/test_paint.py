@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from ihbench.methods.inpainthuman.inpainting.mini_weights import save_mini
+from ihbench.diffusion.mini.weights import save_mini
 from ihbench.methods.inpainthuman.inpainting.paint_rows import FULL
 from ihbench.methods.inpainthuman.inpainting.paint_table import summary, table
 from tests.methods.tiny_diffusion import tiny_backbone

@@ -11,12 +11,12 @@ import torch
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.clock.threads import one_torch_thread
+from ihbench.diffusion import personalise
+from ihbench.diffusion.diffusion_inpainter import DiffusionInpainter
+from ihbench.diffusion.inpaint_config import InpaintConfig
+from ihbench.diffusion.personalise import Personaliser, best_seen
+from ihbench.diffusion.subject_token import ANYBODY, SubjectToken
 from ihbench.errors import BadInput, Diverged
-from ihbench.methods.inpainthuman.inpainting import personalise
-from ihbench.methods.inpainthuman.inpainting.diffusion_inpainter import DiffusionInpainter
-from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
-from ihbench.methods.inpainthuman.inpainting.personalise import Personaliser, best_seen
-from ihbench.methods.inpainthuman.inpainting.subject_token import ANYBODY, SubjectToken
 from tests.methods.tiny_diffusion import crops, images_equal, same, tiny_backbone, weights
 
 QUIET = Progress.silent()
@@ -256,7 +256,7 @@ class TestTrouble:
 
     @pytest.mark.parametrize("limit", [2, 0])
     def test_sampling_out_of_memory_halves_the_batch_then_says_what_to_do(self, monkeypatch, limit):
-        from ihbench.methods.inpainthuman.inpainting import sampling
+        from ihbench.diffusion import sampling
 
         honest, sizes = sampling.sample, []
 

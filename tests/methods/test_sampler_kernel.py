@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from ihbench.methods.inpainthuman.inpainting.sampler_kernel import hidden_middle, sampler_rows
+from ihbench.kernels.sampler import hidden_middle, sampler_rows
 from tests.methods.tiny_diffusion import CROP, same, tiny_backbone, weights
 
 

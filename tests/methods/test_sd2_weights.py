@@ -23,12 +23,12 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from transformers import AutoTokenizer, CLIPTextModel
 
+from ihbench.diffusion.backbone import Backbone
+from ihbench.diffusion.crops.diffusion_batch import DiffusionBatch
+from ihbench.diffusion.sampling import sample
+from ihbench.diffusion.sd2_weights import load_sd2
+from ihbench.diffusion.subject_token import SubjectToken
 from ihbench.errors import BadInput
-from ihbench.methods.inpainthuman.inpainting.backbone import Backbone
-from ihbench.methods.inpainthuman.inpainting.diffusion_batch import DiffusionBatch
-from ihbench.methods.inpainthuman.inpainting.sampling import sample
-from ihbench.methods.inpainthuman.inpainting.sd2_weights import load_sd2
-from ihbench.methods.inpainthuman.inpainting.subject_token import SubjectToken
 from tests.methods.sd2_miniature import make_miniature, write_json
 
 UNET_FILE = "unet/diffusion_pytorch_model.safetensors"

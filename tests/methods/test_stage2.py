@@ -11,9 +11,9 @@ from ihbench.body.uv import texel_table
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.clock.threads import one_torch_thread
+from ihbench.diffusion.crops.crop_view import cut_view, with_frames
+from ihbench.diffusion.inpaint_config import InpaintConfig
 from ihbench.methods.inpainthuman import stage2
-from ihbench.methods.inpainthuman.inpainting.crop_view import cut_view, with_frames
-from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
 from ihbench.methods.inpainthuman.inpainting.painted_view import paste_back
 from ihbench.methods.inpainthuman.inpainting.shown_view import orbit, turntable_view, with_known_surface
 from ihbench.methods.inpainthuman.inpainting.surface_need import SeenSurface, key_views, pixels_of, seen_surface

@@ -13,11 +13,11 @@ import pytest
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.clock.threads import one_torch_thread
+from ihbench.diffusion.mini.weights import save_mini
+from ihbench.diffusion.personalise import ADAPT_STATE, TI_STATE
 from ihbench.errors import BadInput
 from ihbench.methods.inpainthuman.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.config import QUICK, InpaintHumanConfig, config_from, outside_files
-from ihbench.methods.inpainthuman.inpainting.mini_weights import save_mini
-from ihbench.methods.inpainthuman.inpainting.personalise import ADAPT_STATE, TI_STATE
 from ihbench.methods.inpainthuman.method import InpaintHuman
 from ihbench.methods.inpainthuman.stage1 import Stage1, draw, loss_of, prepare_target
 from ihbench.metrics.ssim import ssim_map
@@ -138,7 +138,7 @@ import sys
 from dataclasses import replace
 from ihbench.clock.ledger import Ledger
 from ihbench.methods.inpainthuman.config import QUICK
-from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
+from ihbench.diffusion.inpaint_config import InpaintConfig
 from ihbench.methods.inpainthuman.method import InpaintHuman
 from ihbench.methods.inpainthuman.stage1 import Stage1
 from ihbench.clock.progress import Progress
@@ -175,7 +175,7 @@ def test_diffusers_is_imported_by_the_painter_that_needs_it(filler, loaded):
 def test_looking_at_mini_weights_imports_no_diffusers(mini):
     code = (
         "import sys; from pathlib import Path\n"
-        "from ihbench.methods.inpainthuman.inpainting.mini_folder import check_mini\n"
+        "from ihbench.diffusion.mini.folder import check_mini\n"
         f"check_mini(Path({str(mini)!r})); print('diffusers' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
@@ -293,7 +293,7 @@ def test_lpips_weights_that_come_later_make_another_run(mini, tmp_path, monkeypa
 
 
 def test_a_hub_id_is_the_snapshot_it_stands_for(tmp_path, monkeypatch):
-    from ihbench.methods.inpainthuman.inpainting import checkpoint
+    from ihbench.diffusion import checkpoint
 
     given = replace(QUICK, inpaint=replace(QUICK.inpaint, backbone="sd2", weights="someone/sd2-inpainting"))
     assert outside_files(given) == []  # not in the cache: the run says so

@@ -14,19 +14,17 @@ from ihbench import bounds
 from ihbench.cli import main
 from ihbench.clock.progress import Progress
 from ihbench.clock.threads import one_torch_thread
+from ihbench.diffusion.crops import crop_album
+from ihbench.diffusion.crops.crop_album import CropAlbum
+from ihbench.diffusion.mini import batches as mini_batches
+from ihbench.diffusion.mini import model as mini_model
+from ihbench.diffusion.mini import train_mini
+from ihbench.diffusion.mini import validation as mini_validation
+from ihbench.diffusion.mini import weights as mini_weights
+from ihbench.diffusion.mini.train_mini import MiniTrainer, curve_of
+from ihbench.diffusion.mini.training import MiniTraining
+from ihbench.diffusion.mini.weights import load_mini, save_mini
 from ihbench.errors import BadInput
-from ihbench.methods.inpainthuman.inpainting import (
-    crop_album,
-    mini_batches,
-    mini_model,
-    mini_validation,
-    mini_weights,
-    train_mini,
-)
-from ihbench.methods.inpainthuman.inpainting.crop_album import CropAlbum
-from ihbench.methods.inpainthuman.inpainting.mini_training import MiniTraining
-from ihbench.methods.inpainthuman.inpainting.mini_weights import load_mini, save_mini
-from ihbench.methods.inpainthuman.inpainting.train_mini import MiniTrainer, curve_of
 from tests.conftest import contents
 from tests.methods.tiny_diffusion import same, tiny_backbone, weights
 

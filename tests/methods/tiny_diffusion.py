@@ -7,9 +7,9 @@ from unittest.mock import patch
 import numpy as np
 import torch
 
-from ihbench.methods.inpainthuman.inpainting import mini_model
-from ihbench.methods.inpainthuman.inpainting.backbone import Backbone
-from ihbench.methods.inpainthuman.inpainting.crop_view import CropView, cut_view
+from ihbench.diffusion.backbone import Backbone
+from ihbench.diffusion.crops.crop_view import CropView, cut_view
+from ihbench.diffusion.mini import model as mini_model
 from ihbench.scene.contracts import MaskState, TrainView
 from tests.bench.fake_capture import the_body
 from tests.methods.tiny_fit import training_views

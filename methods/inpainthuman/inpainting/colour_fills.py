@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.clock.progress import Progress
-from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
+from ihbench.diffusion.crops.crop_view import CropView
 
 RADIUS = 3.0  # px, the neighbourhood that OpenCV's methods look at
 GREY = 128  # where nothing at all is known
@@ -65,7 +65,7 @@ class PushPull:
     def inpaint(self, views: list[CropView], progress: Progress) -> list[NDArray[np.uint8]]:
         import torch
 
-        from ihbench.methods.inpainthuman.inpainting.push_pull import push_pull
+        from ihbench.diffusion.crops.push_pull import push_pull
 
         everybody = mean_person(views)
         out = []

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ihbench.body import Body
 from ihbench.body.uv import texel_table
-from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
+from ihbench.diffusion.crops.crop_view import CropView
 from ihbench.methods.inpainthuman.inpainting.patch_texture import lab, patch_count, patch_texture
 from ihbench.methods.inpainthuman.inpainting.surface_colours import faced_texels, off_the_rim
 from ihbench.metrics.flip import flip

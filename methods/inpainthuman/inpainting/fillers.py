@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from ihbench.body import Body
+from ihbench.diffusion.crops.crop_view import Inpainter
 from ihbench.methods.inpainthuman.inpainting.colour_fills import MeanColour, NavierStokes, PushPull, Telea
-from ihbench.methods.inpainthuman.inpainting.crop_view import Inpainter
 from ihbench.methods.inpainthuman.inpainting.texture_fills import MirroredTexture, TemporalCopy
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
-from ihbench.methods.inpainthuman.inpainting.part_map import part_colours
+from ihbench.diffusion.crops.crop_view import CropView
+from ihbench.diffusion.crops.part_map import part_colours
 
 GAP = 4  # px
 HIDDEN = np.array([255, 0, 200], np.uint8)  # a colour that nobody wears

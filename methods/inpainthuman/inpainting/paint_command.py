@@ -13,8 +13,8 @@ from typing import Annotated, Any, Literal
 from ihbench.bounds import SEEDS, Within, refuse_repeated
 from ihbench.commands.device import check_device
 from ihbench.commands.scene_choice import ProtocolChanges
+from ihbench.diffusion.inpaint_config import InpaintConfig
 from ihbench.errors import BadInput
-from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
 from ihbench.methods.inpainthuman.inpainting.paint_rows import ROWS
 
 SUMMARY = "how well InpaintHuman's painters fill hidden pixels, against the truth behind the occluder"

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from ihbench.body import Body
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
+from ihbench.diffusion.crops.crop_view import CropView, cut_view
+from ihbench.diffusion.inpaint_config import InpaintConfig
 from ihbench.errors import BadInput
-from ihbench.methods.inpainthuman.inpainting.crop_view import CropView, cut_view
-from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
 from ihbench.methods.inpainthuman.inpainting.paint_rows import DIFFUSION, FILLS, FULL
 from ihbench.metrics.statistics import mean_interval, paired_test
 from ihbench.scene.contracts import Capture
@@ -98,7 +98,7 @@ def _paint(
 
         painted = fillers(body, background)[row].inpaint(views, progress)
         return [painted[k] for k in chosen]
-    from ihbench.methods.inpainthuman.inpainting.diffusion_inpainter import DiffusionInpainter, load_backbone
+    from ihbench.diffusion.diffusion_inpainter import DiffusionInpainter, load_backbone
 
     ti, lora, sg = DIFFUSION[row]
     switched = replace(config, ti=ti, lora=lora, sg=sg)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
+from ihbench.diffusion.crops.crop_view import CropView
 from ihbench.scene.contracts import MaskState, TrainView
 
 

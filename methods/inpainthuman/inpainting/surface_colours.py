@@ -12,7 +12,7 @@ from scipy.ndimage import distance_transform_edt
 
 from ihbench.body import Body
 from ihbench.body.uv import Texels, map_coordinates, texel_table
-from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
+from ihbench.diffusion.crops.crop_view import CropView
 from ihbench.render.zbuffer import rasterize
 from ihbench.scene.contracts import MaskState, TrainView
 from ihbench.scene.visibility import surface_texels

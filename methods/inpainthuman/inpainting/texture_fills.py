@@ -12,9 +12,9 @@ from scipy.spatial import KDTree
 from ihbench.body import Body
 from ihbench.body.uv import Texels, texel_table
 from ihbench.clock.progress import Progress
+from ihbench.diffusion.crops.crop_view import CropView
+from ihbench.diffusion.crops.part_map import NO_PART, smpl_parts
 from ihbench.methods.inpainthuman.inpainting.colour_fills import mean_person, on_background
-from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
-from ihbench.methods.inpainthuman.inpainting.part_map import NO_PART, smpl_parts
 from ihbench.methods.inpainthuman.inpainting.surface_colours import faced_texels, off_the_rim, pixel_texels
 
 Seen = tuple[NDArray[np.int32], NDArray[np.uint8]]  # texels [n], RGB [n, 3]

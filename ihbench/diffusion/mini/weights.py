@@ -10,14 +10,14 @@ from typing import Any
 
 import torch
 
+from ihbench.diffusion.backbone import Backbone
+from ihbench.diffusion.checkpoint import UnreadModule, empty_module
+from ihbench.diffusion.mini.folder import SHIPPED, STEMS, check_mini
+from ihbench.diffusion.mini.model import SIZE
+from ihbench.diffusion.quiet_libraries import quiet_libraries
+from ihbench.diffusion.text_encoder import unread_text_encoder
 from ihbench.errors import BadInput
 from ihbench.files import atomic
-from ihbench.methods.inpainthuman.inpainting.backbone import Backbone
-from ihbench.methods.inpainthuman.inpainting.checkpoint import UnreadModule, empty_module
-from ihbench.methods.inpainthuman.inpainting.mini_folder import SHIPPED, STEMS, check_mini
-from ihbench.methods.inpainthuman.inpainting.mini_model import SIZE
-from ihbench.methods.inpainthuman.inpainting.quiet_libraries import quiet_libraries
-from ihbench.methods.inpainthuman.inpainting.text_encoder import unread_text_encoder
 
 
 def save_mini(backbone: Backbone, folder: Path) -> None:
@@ -48,7 +48,7 @@ def load_mini(folder: Path | None = None, device: str = "cpu") -> Backbone:
     found, configs = check_mini(SHIPPED if folder is None else folder)
     from diffusers import ControlNetModel, DDIMScheduler, UNet2DConditionModel
 
-    from ihbench.methods.inpainthuman.inpainting.block_transform import BlockTransform
+    from ihbench.diffusion.mini.block_transform import BlockTransform
 
     place = torch.device(device)
 

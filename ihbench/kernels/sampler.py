@@ -12,14 +12,14 @@ from torch import Tensor
 
 from ihbench import registry
 from ihbench.body import load_body
+from ihbench.diffusion.backbone import Backbone
+from ihbench.diffusion.crops.crop_view import CropView, cut_view
+from ihbench.diffusion.crops.diffusion_batch import DiffusionBatch, batch_of, shared_noise
+from ihbench.diffusion.inpaint_config import InpaintConfig
+from ihbench.diffusion.mini.weights import load_mini
+from ihbench.diffusion.sampling import sample
+from ihbench.diffusion.subject_token import ANYBODY
 from ihbench.kernels.measuring import Row, interleave, peak_mib, summary, timed
-from ihbench.methods.inpainthuman.inpainting.backbone import Backbone
-from ihbench.methods.inpainthuman.inpainting.crop_view import CropView, cut_view
-from ihbench.methods.inpainthuman.inpainting.diffusion_batch import DiffusionBatch, batch_of, shared_noise
-from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
-from ihbench.methods.inpainthuman.inpainting.mini_weights import load_mini
-from ihbench.methods.inpainthuman.inpainting.sampling import sample
-from ihbench.methods.inpainthuman.inpainting.subject_token import ANYBODY
 from ihbench.scene.contracts import MaskState, TrainView
 
 STEPS = (1, 2, 3, 6, 12)

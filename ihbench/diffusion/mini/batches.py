@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from ihbench.methods.inpainthuman.inpainting.backbone import padded_ids
-from ihbench.methods.inpainthuman.inpainting.crop_album import Page
-from ihbench.methods.inpainthuman.inpainting.mini_model import SIZE
-from ihbench.methods.inpainthuman.inpainting.mini_training import MiniTraining
-from ihbench.methods.inpainthuman.inpainting.random_mask import random_mask
+from ihbench.diffusion.backbone import padded_ids
+from ihbench.diffusion.crops.crop_album import Page
+from ihbench.diffusion.crops.random_mask import random_mask
+from ihbench.diffusion.mini.model import SIZE
+from ihbench.diffusion.mini.training import MiniTraining
 
 PERSON = "a photo of a person"
 TRAIT_TOKENS = 4

@@ -27,13 +27,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ihbench.diffusion.checkpoint import has_pickles, read_json, weight_files
+from ihbench.diffusion.crops.crop_view import CropView
+from ihbench.diffusion.crops.part_map import smpl_parts
+from ihbench.diffusion.memory import said_when_full
+from ihbench.diffusion.quiet_libraries import quiet_libraries
 from ihbench.errors import BadInput
 from ihbench.files.paths import user_path
-from ihbench.methods.inpainthuman.inpainting.checkpoint import has_pickles, read_json, weight_files
-from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
-from ihbench.methods.inpainthuman.inpainting.memory import said_when_full
-from ihbench.methods.inpainthuman.inpainting.part_map import smpl_parts
-from ihbench.methods.inpainthuman.inpainting.quiet_libraries import quiet_libraries
 
 RIM = 0.03  # of the body's height in the crop: how far outside of the posed body the painted image decides
 # of the body's height: farther inside it all is person. A fitted body is about so exact; people stand out from the

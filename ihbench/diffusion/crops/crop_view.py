@@ -12,8 +12,8 @@ from ihbench.body import Body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.clock.progress import Progress
-from ihbench.methods.inpainthuman.inpainting.part_map import NO_PART, part_labels
-from ihbench.methods.inpainthuman.inpainting.person_crop import PersonCrop, person_crop
+from ihbench.diffusion.crops.part_map import NO_PART, part_labels
+from ihbench.diffusion.crops.person_crop import PersonCrop, person_crop
 from ihbench.scene.contracts import MaskState, TrainView
 
 EDGE = 1e-6  # share of a crop's pixel above which it counts

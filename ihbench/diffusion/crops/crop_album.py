@@ -18,11 +18,11 @@ from ihbench import registry
 from ihbench.body import load_body
 from ihbench.clock.interruption import end_with_parent
 from ihbench.clock.progress import Progress
+from ihbench.diffusion.crops.part_map import part_labels
+from ihbench.diffusion.crops.person_crop import PADDING, person_crop
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.npz import read_npz
-from ihbench.methods.inpainthuman.inpainting.part_map import part_labels
-from ihbench.methods.inpainthuman.inpainting.person_crop import PADDING, person_crop
 
 VERSION = 2  # of what is kept of a photograph
 PAGE = 100  # people per file

@@ -10,9 +10,9 @@ from typing import Any
 import torch
 
 from ihbench import registry
+from ihbench.diffusion.mini.train_mini import curve_of
+from ihbench.diffusion.mini.training import MiniTraining
 from ihbench.files.atomic import write_json, write_text
-from ihbench.methods.inpainthuman.inpainting.mini_training import MiniTraining
-from ihbench.methods.inpainthuman.inpainting.train_mini import curve_of
 from ihbench.version import __version__
 
 CARD = "README.md"

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from ihbench import registry
 from ihbench.clock.progress import Progress
-from ihbench.methods.inpainthuman.inpainting.backbone import Backbone
-from ihbench.methods.inpainthuman.inpainting.crop_album import PAGE, CropAlbum
-from ihbench.methods.inpainthuman.inpainting.diffusion_batch import DiffusionBatch, shared_noise
-from ihbench.methods.inpainthuman.inpainting.part_map import part_colours
-from ihbench.methods.inpainthuman.inpainting.push_pull import push_pull
-from ihbench.methods.inpainthuman.inpainting.sampling import sample
-from ihbench.methods.inpainthuman.inpainting.subject_token import ANYBODY
+from ihbench.diffusion.backbone import Backbone
+from ihbench.diffusion.crops.crop_album import PAGE, CropAlbum
+from ihbench.diffusion.crops.diffusion_batch import DiffusionBatch, shared_noise
+from ihbench.diffusion.crops.part_map import part_colours
+from ihbench.diffusion.crops.push_pull import push_pull
+from ihbench.diffusion.sampling import sample
+from ihbench.diffusion.subject_token import ANYBODY
 
 STEPS = (1, 6, 20)
 NOISES = (0.0, 1.0)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_max_pool2d
 
-from ihbench.methods.inpainthuman.inpainting.push_pull import push_pull
+from ihbench.diffusion.crops.push_pull import push_pull
 
 
 class LatentAutoencoder:

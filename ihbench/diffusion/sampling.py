@@ -9,11 +9,11 @@ from torch import Tensor
 
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
+from ihbench.diffusion.backbone import Backbone
+from ihbench.diffusion.crops.crop_view import CropView
+from ihbench.diffusion.crops.diffusion_batch import DiffusionBatch, batch_of, by_width, shared_noise
+from ihbench.diffusion.memory import ADVICE, out_of_memory
 from ihbench.errors import BadInput, Diverged
-from ihbench.methods.inpainthuman.inpainting.backbone import Backbone
-from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
-from ihbench.methods.inpainthuman.inpainting.diffusion_batch import DiffusionBatch, batch_of, by_width, shared_noise
-from ihbench.methods.inpainthuman.inpainting.memory import ADVICE, out_of_memory
 
 STATE = "stage2-sampled"
 

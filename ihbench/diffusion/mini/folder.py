@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from ihbench.diffusion.checkpoint import CONVERT, has_pickles, read_json, weight_files
+from ihbench.diffusion.text_encoder import TEXT_STEM
 from ihbench.errors import BadInput
 from ihbench.files.paths import user_path
-from ihbench.methods.inpainthuman.inpainting.checkpoint import CONVERT, has_pickles, read_json, weight_files
-from ihbench.methods.inpainthuman.inpainting.text_encoder import TEXT_STEM
 
-SHIPPED = Path(__file__).parent / "mini"
+SHIPPED = Path(__file__).parent / "shipped"
 STEM = "diffusion_pytorch_model"
 STEMS = {"unet": STEM, "controlnet": STEM, "codec": STEM, "text_encoder": TEXT_STEM}
 PARTS = (*STEMS, "tokenizer", "scheduler")

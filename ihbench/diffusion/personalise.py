@@ -16,15 +16,15 @@ from torch import Tensor, nn
 
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
+from ihbench.diffusion.backbone import Backbone, shrink_mask
+from ihbench.diffusion.crops.crop_view import CropView
+from ihbench.diffusion.crops.diffusion_batch import batch_of, by_width
+from ihbench.diffusion.crops.push_pull import push_pull
+from ihbench.diffusion.crops.random_mask import SHARES, random_mask
+from ihbench.diffusion.inpaint_config import InpaintConfig
+from ihbench.diffusion.memory import ADVICE, out_of_memory
+from ihbench.diffusion.subject_token import ANYBODY, SubjectToken
 from ihbench.errors import BadInput
-from ihbench.methods.inpainthuman.inpainting.backbone import Backbone, shrink_mask
-from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
-from ihbench.methods.inpainthuman.inpainting.diffusion_batch import batch_of, by_width
-from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
-from ihbench.methods.inpainthuman.inpainting.memory import ADVICE, out_of_memory
-from ihbench.methods.inpainthuman.inpainting.push_pull import push_pull
-from ihbench.methods.inpainthuman.inpainting.random_mask import SHARES, random_mask
-from ihbench.methods.inpainthuman.inpainting.subject_token import ANYBODY, SubjectToken
 
 TI_SHARES = (
     0.35,

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ihbench.methods.inpainthuman.inpainting.backbone import Backbone
-from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
-from ihbench.methods.inpainthuman.inpainting.part_map import part_colours
+from ihbench.diffusion.backbone import Backbone
+from ihbench.diffusion.crops.crop_view import CropView
+from ihbench.diffusion.crops.part_map import part_colours
 
 
 @dataclass(frozen=True)

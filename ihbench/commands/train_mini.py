@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ihbench.commands.device import check_device
+from ihbench.diffusion.mini.training import MiniTraining
 from ihbench.errors import BadInput
-from ihbench.methods.inpainthuman.inpainting.mini_training import MiniTraining
 
 SUMMARY = "train the small diffusion backbone on procedural people; goes on where it stopped"
 TRAINING = "training"  # folder in the output: state and loss curve
@@ -43,13 +43,13 @@ def main(argv: list[str]) -> int:
 
 def _train(chosen: Any) -> dict[str, Any]:
     from ihbench.clock.progress import Progress
+    from ihbench.diffusion.mini.card import write_card
+    from ihbench.diffusion.mini.folder import SHIPPED, check_mini
+    from ihbench.diffusion.mini.train_mini import MiniTrainer
+    from ihbench.diffusion.mini.validation import validate
+    from ihbench.diffusion.mini.weights import save_mini
     from ihbench.files import removal
     from ihbench.files.locks import locked
-    from ihbench.methods.inpainthuman.inpainting.mini_card import write_card
-    from ihbench.methods.inpainthuman.inpainting.mini_folder import SHIPPED, check_mini
-    from ihbench.methods.inpainthuman.inpainting.mini_validation import validate
-    from ihbench.methods.inpainthuman.inpainting.mini_weights import save_mini
-    from ihbench.methods.inpainthuman.inpainting.train_mini import MiniTrainer
     from ihbench.scene.data_source import cache_folder
 
     check_device(chosen.device)
@@ -77,9 +77,9 @@ def _train(chosen: Any) -> dict[str, Any]:
 def _check_out(out: Path) -> None:
     """Raise `BadInput` where training would overwrite what is not of an earlier training: another model has folders
     of the same names, and a project a README.md."""
-    from ihbench.methods.inpainthuman.inpainting.mini_card import CARD, FIGURES
-    from ihbench.methods.inpainthuman.inpainting.mini_folder import PARTS, check_mini
-    from ihbench.methods.inpainthuman.inpainting.train_mini import CURVE, STATE
+    from ihbench.diffusion.mini.card import CARD, FIGURES
+    from ihbench.diffusion.mini.folder import PARTS, check_mini
+    from ihbench.diffusion.mini.train_mini import CURVE, STATE
 
     state = out / TRAINING / STATE
     names = sorted(name for name in (*PARTS, CARD, FIGURES, TRAINING) if os.path.lexists(out / name))

@@ -6,8 +6,8 @@ from typing import Any
 
 import torch
 
-from ihbench.methods.inpainthuman.inpainting.backbone import Backbone
-from ihbench.methods.inpainthuman.inpainting.block_transform import BlockTransform
+from ihbench.diffusion.backbone import Backbone
+from ihbench.diffusion.mini.block_transform import BlockTransform
 
 SIZE = 128  # px, height of a crop
 TEXT_WIDTH = 128

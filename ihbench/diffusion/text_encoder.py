@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ihbench.methods.inpainthuman.inpainting.checkpoint import UnreadModule, empty_module
+from ihbench.diffusion.checkpoint import UnreadModule, empty_module
 
 TEXT_STEM = "model"
 FIELDS = (

@@ -23,9 +23,8 @@ from typing import Any
 
 import torch
 
-from ihbench.errors import BadInput
-from ihbench.methods.inpainthuman.inpainting.backbone import Backbone, LatentAutoencoder
-from ihbench.methods.inpainthuman.inpainting.checkpoint import (
+from ihbench.diffusion.backbone import Backbone, LatentAutoencoder
+from ihbench.diffusion.checkpoint import (
     CONVERT,
     UnreadModule,
     empty_module,
@@ -34,9 +33,10 @@ from ihbench.methods.inpainthuman.inpainting.checkpoint import (
     read_json,
     weight_files,
 )
-from ihbench.methods.inpainthuman.inpainting.memory import said_when_full
-from ihbench.methods.inpainthuman.inpainting.part_controlnet import new_controlnet
-from ihbench.methods.inpainthuman.inpainting.text_encoder import TEXT_STEM, unread_text_encoder
+from ihbench.diffusion.memory import said_when_full
+from ihbench.diffusion.part_controlnet import new_controlnet
+from ihbench.diffusion.text_encoder import TEXT_STEM, unread_text_encoder
+from ihbench.errors import BadInput
 
 STEMS = {"unet": "diffusion_pytorch_model", "vae": "diffusion_pytorch_model", "text_encoder": TEXT_STEM}
 OPTION, CONTROL_OPTION = "--method.inpaint.weights", "--method.inpaint.control-weights"

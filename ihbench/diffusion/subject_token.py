@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ihbench.diffusion.backbone import Backbone
 from ihbench.errors import BadInput
-from ihbench.methods.inpainthuman.inpainting.backbone import Backbone
 
 PHOTO_OF = "a photo of"
 ANYBODY = f"{PHOTO_OF} a person"

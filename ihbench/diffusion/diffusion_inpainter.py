@@ -9,22 +9,22 @@ from numpy.typing import NDArray
 
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.methods.inpainthuman.inpainting.backbone import Backbone
-from ihbench.methods.inpainthuman.inpainting.crop_view import CropView
-from ihbench.methods.inpainthuman.inpainting.inpaint_config import InpaintConfig
-from ihbench.methods.inpainthuman.inpainting.personalise import Curve, Personaliser
-from ihbench.methods.inpainthuman.inpainting.sampling import inpaint_views
-from ihbench.methods.inpainthuman.inpainting.subject_token import ANYBODY, new_words
+from ihbench.diffusion.backbone import Backbone
+from ihbench.diffusion.crops.crop_view import CropView
+from ihbench.diffusion.inpaint_config import InpaintConfig
+from ihbench.diffusion.personalise import Curve, Personaliser
+from ihbench.diffusion.sampling import inpaint_views
+from ihbench.diffusion.subject_token import ANYBODY, new_words
 
 
 def load_backbone(config: InpaintConfig, device: str) -> Backbone:
     """The backbone that a configuration names. Raises `BadInput` for weights that are missing, wrong or damaged."""
     if config.backbone == "sd2":
-        from ihbench.methods.inpainthuman.inpainting.sd2_weights import load_sd2
+        from ihbench.diffusion.sd2_weights import load_sd2
 
         control = config.control_weights or None
         return load_sd2(config.weights, control, device=device, memory_lean=config.memory_lean)
-    from ihbench.methods.inpainthuman.inpainting.mini_weights import load_mini
+    from ihbench.diffusion.mini.weights import load_mini
 
     return load_mini(Path(config.weights) if config.weights else None, device)
 
@@ -33,12 +33,12 @@ def check_backbone(config: InpaintConfig) -> None:
     """Raises `BadInput` for what `load_backbone` and personalisation would complain of and a look at the folders can
     tell, before an hour of fitting."""
     if config.backbone == "sd2":
-        from ihbench.methods.inpainthuman.inpainting.sd2_weights import look_at_sd2
+        from ihbench.diffusion.sd2_weights import look_at_sd2
 
         tokenizer = look_at_sd2(config.weights, config.control_weights or None).tokenizer
     else:
-        from ihbench.methods.inpainthuman.inpainting.mini_folder import SHIPPED, check_mini
-        from ihbench.methods.inpainthuman.inpainting.mini_weights import mini_tokenizer
+        from ihbench.diffusion.mini.folder import SHIPPED, check_mini
+        from ihbench.diffusion.mini.weights import mini_tokenizer
 
         tokenizer = mini_tokenizer(check_mini(Path(config.weights) if config.weights else SHIPPED)[0])
     if config.ti:

@@ -18,15 +18,15 @@ from torch import Tensor, nn
 
 from ihbench import registry
 from ihbench.clock.progress import Progress
+from ihbench.diffusion.backbone import Backbone, shrink_mask
+from ihbench.diffusion.crops.crop_album import PAGE, CropAlbum
+from ihbench.diffusion.crops.part_map import part_colours
+from ihbench.diffusion.mini.batches import TRAIT_TOKENS, Batches, Crops, MiniBatch
+from ihbench.diffusion.mini.model import SIZE, TEXT_WIDTH, new_mini
+from ihbench.diffusion.mini.training import MiniTraining
+from ihbench.diffusion.mini.weights import load_mini
 from ihbench.errors import BadInput, Diverged
 from ihbench.files import atomic
-from ihbench.methods.inpainthuman.inpainting.backbone import Backbone, shrink_mask
-from ihbench.methods.inpainthuman.inpainting.crop_album import PAGE, CropAlbum
-from ihbench.methods.inpainthuman.inpainting.mini_batches import TRAIT_TOKENS, Batches, Crops, MiniBatch
-from ihbench.methods.inpainthuman.inpainting.mini_model import SIZE, TEXT_WIDTH, new_mini
-from ihbench.methods.inpainthuman.inpainting.mini_training import MiniTraining
-from ihbench.methods.inpainthuman.inpainting.mini_weights import load_mini
-from ihbench.methods.inpainthuman.inpainting.part_map import part_colours
 
 STATE = "training.safetensors"
 CURVE = "curve.jsonl"

@@ -1,0 +1,1 @@
+"""The one diffusion path: backbones, personalisation, sampling, complete silhouettes."""

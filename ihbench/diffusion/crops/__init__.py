@@ -1,0 +1,1 @@
+"""What a diffusion model is shown of a training view: person crops, part maps, masks, batches."""
