@@ -10,9 +10,9 @@ from ihbench.body import Body
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
-from ihbench.methods.inpainthuman.avatar import GaussianAvatar
+from ihbench.methods.inpainthuman.avatar.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.config import InpaintHumanConfig
-from ihbench.methods.inpainthuman.stage1 import Stage1
+from ihbench.methods.inpainthuman.stages.stage1 import Stage1
 from ihbench.scene.contracts import TrainingSet
 
 
@@ -44,8 +44,8 @@ class InpaintHuman:
             Stage1(avatar, training, seed, ledger).run(progress)
         if self.config.paints:
             # imported here: a run without inpainting must not pay for it
-            from ihbench.methods.inpainthuman.stage2 import Stage2
-            from ihbench.methods.inpainthuman.stage3 import Stage3
+            from ihbench.methods.inpainthuman.stages.stage2 import Stage2
+            from ihbench.methods.inpainthuman.stages.stage3 import Stage3
 
             with ledger.stage("fit/stage2"):
                 painted = Stage2(avatar, training, inpaint, seed, ledger).run(progress)

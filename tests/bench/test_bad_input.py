@@ -171,7 +171,7 @@ def test_fewer_frames_than_the_protocol_reads(refused_run, data):
 
 
 def test_everybody_hidden_in_every_frame(refused_run, refused, tmp_path, monkeypatch):
-    from ihbench.methods.inpainthuman.stage1 import Stage1
+    from ihbench.methods.inpainthuman.stages.stage1 import Stage1
 
     monkeypatch.setattr(Stage1, "_one_step", lambda *_: pytest.fail("a step was made"))
     protocol = tiny_protocol(

@@ -170,7 +170,7 @@ def test_an_absurd_step_size_is_a_divergence_even_when_the_curve_is_measured_the
 
 
 def test_a_divergence_is_recorded_at_its_first_bad_step_and_stands(bench, monkeypatch):
-    from ihbench.methods.inpainthuman import stage1
+    from ihbench.methods.inpainthuman.stages import stage1
 
     calls, loss_of = [], stage1.loss_of
 

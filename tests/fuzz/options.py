@@ -270,7 +270,7 @@ def cut_short() -> Iterator[None]:
     places = (
         *("ihbench.run.run_loop.run_scene", "ihbench.run.cells.run_scene", "ihbench.metrics.oracles.check.check"),
         *("ihbench.stress.run.run_cases", "ihbench.kernels.table.run_kernels", "ihbench.metrics.weights.fetch"),
-        "ihbench.methods.inpainthuman.inpainting.paint_table.paint_scene",
+        "ihbench.methods.inpainthuman.studies.paint_table.paint_scene",
         "ihbench.diffusion.crops.crop_album.CropAlbum.make",
         "ihbench.datasets.standin.photograph.photograph",
     )

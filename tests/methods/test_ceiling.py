@@ -9,9 +9,9 @@ import math
 import numpy as np
 import pytest
 
-from ihbench.methods.inpainthuman.ceiling import CeilingRow, painted_psnr, with_truth
-from ihbench.methods.inpainthuman.ceiling_command import table
 from ihbench.methods.inpainthuman.inpainting.painted_view import PaintedView
+from ihbench.methods.inpainthuman.studies.ceiling import CeilingRow, painted_psnr, with_truth
+from ihbench.methods.inpainthuman.studies.ceiling_command import table
 from ihbench.record.results import read_result
 from ihbench.scene.contracts import MaskState, TrainView
 from tests.bench.fake_capture import a_camera, a_pose

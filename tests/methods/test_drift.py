@@ -10,8 +10,8 @@ from skimage.color import rgb2lab
 
 from ihbench.body import texel_table
 from ihbench.files import atomic
-from ihbench.methods.inpainthuman.inpainting.drift import Drift, flicker, hidden_scores, identity_drift
-from ihbench.methods.inpainthuman.inpainting.patch_texture import STATISTICS, lab, patch_count, patch_texture
+from ihbench.methods.inpainthuman.studies.drift import Drift, flicker, hidden_scores, identity_drift
+from ihbench.methods.inpainthuman.studies.patch_texture import STATISTICS, lab, patch_count, patch_texture
 from ihbench.metrics import psnr, ssim
 from ihbench.metrics.flip import flip
 from tests.bench.fake_capture import the_body

@@ -14,9 +14,9 @@ from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput
-from ihbench.methods.inpainthuman.avatar import GaussianAvatar
+from ihbench.methods.inpainthuman.avatar.avatar import GaussianAvatar
+from ihbench.methods.inpainthuman.avatar.decoder import GaussianDecoder, positional_encoding, scale_factor
 from ihbench.methods.inpainthuman.config import QUICK
-from ihbench.methods.inpainthuman.decoder import GaussianDecoder, positional_encoding, scale_factor
 from ihbench.methods.inpainthuman.method import InpaintHuman
 from ihbench.render.splat import render_gaussians
 from ihbench.render.splats import LOW_PASS

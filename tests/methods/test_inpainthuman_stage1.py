@@ -13,7 +13,7 @@ from ihbench.clock.progress import Progress
 from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput, Diverged
 from ihbench.methods.inpainthuman.method import InpaintHuman
-from ihbench.methods.inpainthuman.stage1 import Stage1, body_window, loss_of, prepare_target
+from ihbench.methods.inpainthuman.stages.stage1 import Stage1, body_window, loss_of, prepare_target
 from ihbench.metrics import psnr
 from ihbench.render.splat import render_gaussians
 from ihbench.scene.contracts import MaskState, TrainingSet

@@ -7,8 +7,8 @@ import json
 import pytest
 
 from ihbench.diffusion.mini.weights import save_mini
-from ihbench.methods.inpainthuman.inpainting.paint_rows import FULL
-from ihbench.methods.inpainthuman.inpainting.paint_table import summary, table
+from ihbench.methods.inpainthuman.studies.paint_rows import FULL
+from ihbench.methods.inpainthuman.studies.paint_table import summary, table
 from tests.methods.tiny_diffusion import tiny_backbone
 
 

@@ -13,11 +13,11 @@ from ihbench.clock.progress import Progress
 from ihbench.clock.threads import one_torch_thread
 from ihbench.diffusion.crops.crop_view import cut_view, with_frames
 from ihbench.diffusion.inpaint_config import InpaintConfig
-from ihbench.methods.inpainthuman import stage2
 from ihbench.methods.inpainthuman.inpainting.painted_view import paste_back
 from ihbench.methods.inpainthuman.inpainting.shown_view import orbit, turntable_view, with_known_surface
 from ihbench.methods.inpainthuman.inpainting.surface_need import SeenSurface, key_views, pixels_of, seen_surface
-from ihbench.methods.inpainthuman.stage2 import Stage2
+from ihbench.methods.inpainthuman.stages import stage2
+from ihbench.methods.inpainthuman.stages.stage2 import Stage2
 from ihbench.scene.contracts import MaskState
 from ihbench.scene.visibility import surface_texels
 from tests.bench.fake_capture import a_camera, a_pose, the_body, train_view

@@ -15,9 +15,14 @@ from ihbench.errors import BadInput, Diverged
 from ihbench.methods.inpainthuman.config import PAPER, QUICK
 from ihbench.methods.inpainthuman.inpainting.painted_view import PaintedView
 from ihbench.methods.inpainthuman.refine_config import RefineConfig
-from ihbench.methods.inpainthuman.refine_loss import PaintedTarget, load_perceptual, prepare_painted, refine_loss
-from ihbench.methods.inpainthuman.stage1 import draw, loss_of, prepare_target
-from ihbench.methods.inpainthuman.stage3 import Stage3
+from ihbench.methods.inpainthuman.stages.refine_loss import (
+    PaintedTarget,
+    load_perceptual,
+    prepare_painted,
+    refine_loss,
+)
+from ihbench.methods.inpainthuman.stages.stage1 import draw, loss_of, prepare_target
+from ihbench.methods.inpainthuman.stages.stage3 import Stage3
 from ihbench.metrics import psnr, ssim
 from ihbench.metrics.lpips import lpips, random_networks
 from ihbench.metrics.ssim import ssim_map

@@ -16,10 +16,10 @@ from ihbench.clock.threads import one_torch_thread
 from ihbench.diffusion.mini.weights import save_mini
 from ihbench.diffusion.personalise import ADAPT_STATE, TI_STATE
 from ihbench.errors import BadInput
-from ihbench.methods.inpainthuman.avatar import GaussianAvatar
+from ihbench.methods.inpainthuman.avatar.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.config import QUICK, InpaintHumanConfig, config_from, outside_files
 from ihbench.methods.inpainthuman.method import InpaintHuman
-from ihbench.methods.inpainthuman.stage1 import Stage1, draw, loss_of, prepare_target
+from ihbench.methods.inpainthuman.stages.stage1 import Stage1, draw, loss_of, prepare_target
 from ihbench.metrics.ssim import ssim_map
 from ihbench.run.run_loop import RunRequest, _outside
 from ihbench.scene.protocol import load_protocol
@@ -124,7 +124,7 @@ def test_one_fit_is_stage_1_with_ssim_and_more_steps(mini):
 
 @pytest.mark.parametrize("filler", ["mean", "telea", "navier-stokes", "push-pull", "mirror", "temporal"])
 def test_every_simple_filler_runs_without_diffusers(filler, monkeypatch):
-    from ihbench.methods.inpainthuman.stage2 import Stage2
+    from ihbench.methods.inpainthuman.stages.stage2 import Stage2
 
     painters = []
     honest = Stage2._painter
@@ -140,13 +140,13 @@ from ihbench.clock.ledger import Ledger
 from ihbench.methods.inpainthuman.config import QUICK
 from ihbench.diffusion.inpaint_config import InpaintConfig
 from ihbench.methods.inpainthuman.method import InpaintHuman
-from ihbench.methods.inpainthuman.stage1 import Stage1
+from ihbench.methods.inpainthuman.stages.stage1 import Stage1
 from ihbench.clock.progress import Progress
 from tests.bench.fake_capture import a_camera, a_pose, train_view
 from tests.methods.tiny_fit import SIZE, TINY, training_set
 
 def told(when):
-    modules = ("ihbench.methods.inpainthuman.stage2", "diffusers", "transformers")
+    modules = ("ihbench.methods.inpainthuman.stages.stage2", "diffusers", "transformers")
     print(when, *(name.rpartition(".")[2] for name in modules if name in sys.modules))
 
 honest = Stage1.run

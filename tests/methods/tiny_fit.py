@@ -11,9 +11,9 @@ import torch
 from ihbench.body.pose import BodyPose
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.methods.inpainthuman.avatar import GaussianAvatar
+from ihbench.methods.inpainthuman.avatar.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.config import QUICK
-from ihbench.methods.inpainthuman.stage1 import Stage1
+from ihbench.methods.inpainthuman.stages.stage1 import Stage1
 from ihbench.scene.contracts import TrainingSet, TrainView
 from tests.bench.fake_capture import WHITE, a_camera, a_pose, the_body, train_view
 

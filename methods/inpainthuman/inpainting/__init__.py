@@ -1,0 +1,1 @@
+"""Views that are painted: what is asked, simple fills, what comes back."""

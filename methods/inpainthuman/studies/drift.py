@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from ihbench.body import Body
 from ihbench.body.uv import texel_table
 from ihbench.diffusion.crops.crop_view import CropView
-from ihbench.methods.inpainthuman.inpainting.patch_texture import lab, patch_count, patch_texture
 from ihbench.methods.inpainthuman.inpainting.surface_colours import faced_texels, off_the_rim
+from ihbench.methods.inpainthuman.studies.patch_texture import lab, patch_count, patch_texture
 from ihbench.metrics.flip import flip
 from ihbench.metrics.psnr import decibels, psnr
 from ihbench.metrics.ssim import ssim

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from ihbench.camera import Camera
 from ihbench.clock.ledger import Ledger
-from ihbench.methods.inpainthuman.avatar import GaussianAvatar
+from ihbench.fit.dissimilarity import dissimilarity, where_known
+from ihbench.methods.inpainthuman.avatar.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.config import ONE_FIT_SSIM
-from ihbench.methods.inpainthuman.dissimilarity import dissimilarity, where_known
-from ihbench.methods.inpainthuman.optimisation import Optimisation
+from ihbench.methods.inpainthuman.stages.optimisation import Optimisation
 from ihbench.render.splat import render_gaussians
 from ihbench.scene.contracts import MaskState, TrainingSet, TrainView
 from ihbench.scene.views import LazyViews

@@ -16,7 +16,7 @@ from ihbench.commands.device import check_device
 from ihbench.errors import BadInput
 
 if TYPE_CHECKING:
-    from ihbench.methods.inpainthuman.ceiling import CeilingRow
+    from ihbench.methods.inpainthuman.studies.ceiling import CeilingRow
 
 SUMMARY = "what InpaintHuman's runs would have reached with a better painter, up to one that knows the truth"
 REGIONS = ("hidden", "visible", "never_seen")
@@ -48,7 +48,7 @@ def main(argv: list[str]) -> int:
 
 def _ceiling(chosen: CeilingOptions) -> int:
     from ihbench.clock.progress import Progress
-    from ihbench.methods.inpainthuman.ceiling import ceiling
+    from ihbench.methods.inpainthuman.studies.ceiling import ceiling
     from ihbench.record import outputs
     from ihbench.record.results import read_result
 

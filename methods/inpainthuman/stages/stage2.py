@@ -11,7 +11,7 @@ from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.diffusion.crops.crop_view import CropView, Inpainter, cut_view, with_frames
 from ihbench.diffusion.inpaint_config import InpaintConfig
-from ihbench.methods.inpainthuman.avatar import GaussianAvatar
+from ihbench.methods.inpainthuman.avatar.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.inpainting.painted_view import PaintedView, paste_back
 from ihbench.methods.inpainthuman.inpainting.shown_view import turntable_view, with_known_surface
 from ihbench.methods.inpainthuman.inpainting.surface_need import SeenSurface, key_views, seen_surface
@@ -134,7 +134,7 @@ class Stage2:
         silhouettes: list[NDArray[np.bool_]],
     ) -> None:
         """What the paper claims of its paintings, measured against what was filmed, and a picture of them."""
-        from ihbench.methods.inpainthuman.inpainting.drift import flicker, identity_drift
+        from ihbench.methods.inpainthuman.studies.drift import flicker, identity_drift
 
         body, frames = self.training.body, len(self.training.views)
         images = painted + [view.image for view in filmed[len(painted) :]]
@@ -150,7 +150,7 @@ class Stage2:
         )
         if self.ledger.folder is not None:
             from ihbench.files.atomic import write_bytes
-            from ihbench.methods.inpainthuman.inpainting.grid import painted_grid, png
+            from ihbench.methods.inpainthuman.studies.grid import painted_grid, png
 
             write_bytes(self.ledger.folder / "inpainting.png", png(painted_grid(views, painted, silhouettes)))
 

@@ -11,18 +11,18 @@ from torch import Tensor
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
-from ihbench.methods.inpainthuman.avatar import GaussianAvatar
+from ihbench.methods.inpainthuman.avatar.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.inpainting.painted_view import PaintedView
-from ihbench.methods.inpainthuman.optimisation import Optimisation
 from ihbench.methods.inpainthuman.refine_config import RefineConfig
-from ihbench.methods.inpainthuman.refine_loss import (
+from ihbench.methods.inpainthuman.stages.optimisation import Optimisation
+from ihbench.methods.inpainthuman.stages.refine_loss import (
     PaintedTarget,
     Perceptual,
     load_perceptual,
     prepare_painted,
     refine_loss,
 )
-from ihbench.methods.inpainthuman.stage1 import (
+from ihbench.methods.inpainthuman.stages.stage1 import (
     TARGETS_HELD,
     Target,
     draw,

@@ -18,10 +18,10 @@ from ihbench.body.pose import BodyPose
 from ihbench.body.uv import chart_padding, texel_table
 from ihbench.camera import Camera
 from ihbench.errors import BadInput
+from ihbench.methods.inpainthuman.avatar.decoder import GaussianDecoder, positional_encoding, scale_factor
+from ihbench.methods.inpainthuman.avatar.pose_residual import ResidualEncoder, root_free_position_map
+from ihbench.methods.inpainthuman.avatar.uv_features import UVFeatures, bilinear_corners
 from ihbench.methods.inpainthuman.config import InpaintHumanConfig, config_from
-from ihbench.methods.inpainthuman.decoder import GaussianDecoder, positional_encoding, scale_factor
-from ihbench.methods.inpainthuman.pose_residual import ResidualEncoder, root_free_position_map
-from ihbench.methods.inpainthuman.uv_features import UVFeatures, bilinear_corners
 from ihbench.render.splat import render_gaussians
 from ihbench.render.zbuffer import rasterize
 

@@ -23,7 +23,7 @@ from torch import Tensor
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput, Diverged
-from ihbench.methods.inpainthuman.avatar import GaussianAvatar
+from ihbench.methods.inpainthuman.avatar.avatar import GaussianAvatar
 from ihbench.scene.contracts import MaskState, TrainingSet
 
 GOOD_EVERY = 25  # steps between two copies to go back to

@@ -16,7 +16,7 @@ from ihbench.clock.progress import Progress
 from ihbench.diffusion.crops.crop_view import CropView, cut_view
 from ihbench.diffusion.inpaint_config import InpaintConfig
 from ihbench.errors import BadInput
-from ihbench.methods.inpainthuman.inpainting.paint_rows import DIFFUSION, FILLS, FULL
+from ihbench.methods.inpainthuman.studies.paint_rows import DIFFUSION, FILLS, FULL
 from ihbench.metrics.statistics import mean_interval, paired_test
 from ihbench.scene.contracts import Capture
 from ihbench.scene.protocol import Protocol
@@ -38,7 +38,7 @@ def paint_scene(
     device: str = "cpu",
 ) -> tuple[dict[str, Any], NDArray[np.uint8]]:
     """Row -> scores over the scene's hidden pixels, and a picture. Raises `BadInput` when nothing is hidden."""
-    from ihbench.methods.inpainthuman.inpainting.drift import flicker, hidden_scores, identity_drift
+    from ihbench.methods.inpainthuman.studies.drift import flicker, hidden_scores, identity_drift
 
     size, square = SIZES[config.backbone]
     scene = open_scene(capture, protocol)

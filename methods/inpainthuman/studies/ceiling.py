@@ -18,12 +18,12 @@ import numpy as np
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
-from ihbench.methods.inpainthuman.avatar import GaussianAvatar
+from ihbench.methods.inpainthuman.avatar.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.inpainting.painted_view import PaintedView
-from ihbench.methods.inpainthuman.stage1 import Stage1
-from ihbench.methods.inpainthuman.stage2 import STATE as PAINTED_STATE
-from ihbench.methods.inpainthuman.stage2 import Stage2
-from ihbench.methods.inpainthuman.stage3 import Stage3
+from ihbench.methods.inpainthuman.stages.stage1 import Stage1
+from ihbench.methods.inpainthuman.stages.stage2 import STATE as PAINTED_STATE
+from ihbench.methods.inpainthuman.stages.stage2 import Stage2
+from ihbench.methods.inpainthuman.stages.stage3 import Stage3
 from ihbench.metrics import mean_over_frames
 from ihbench.record.reopen import reopen_scene
 from ihbench.record.results import read_result

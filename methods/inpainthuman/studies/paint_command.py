@@ -15,7 +15,7 @@ from ihbench.commands.device import check_device
 from ihbench.commands.scene_choice import ProtocolChanges
 from ihbench.diffusion.inpaint_config import InpaintConfig
 from ihbench.errors import BadInput
-from ihbench.methods.inpainthuman.inpainting.paint_rows import ROWS
+from ihbench.methods.inpainthuman.studies.paint_rows import ROWS
 
 SUMMARY = "how well InpaintHuman's painters fill hidden pixels, against the truth behind the occluder"
 
@@ -58,8 +58,8 @@ def main(argv: list[str]) -> int:
 def _paint(chosen: Any) -> int:
     from ihbench import registry
     from ihbench.clock.progress import Progress
-    from ihbench.methods.inpainthuman.inpainting.grid import png
-    from ihbench.methods.inpainthuman.inpainting.paint_table import paint_scene, summary, table
+    from ihbench.methods.inpainthuman.studies.grid import png
+    from ihbench.methods.inpainthuman.studies.paint_table import paint_scene, summary, table
     from ihbench.record import outputs
     from ihbench.scene.data_source import locate
     from ihbench.scene.protocol import load_protocol

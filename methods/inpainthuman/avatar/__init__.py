@@ -1,0 +1,1 @@
+"""The avatar: UV features, decoder, Gaussians on the posed body."""

@@ -1,0 +1,1 @@
+"""The three stages, and the optimisation that the first and the last share."""

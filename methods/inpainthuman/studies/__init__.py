@@ -1,0 +1,1 @@
+"""What the method is worth and where it ends: ablations, ceiling, painters compared, stress cases."""
