@@ -33,8 +33,8 @@ from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.images import read_image
 from ihbench.files.safe_pickle import load_npy, load_pickle
-from ihbench.reports.paper_numbers import paper_table
-from ihbench.reports.table_reading import read_tables
+from ihbench.reports.lint.table_reading import read_tables
+from ihbench.reports.paper.paper_numbers import paper_table
 from ihbench.scene.protocol import read_protocol
 from tests.bench.fake_capture import a_camera, a_pose
 from tests.fuzz.patience import TooLong, at_most

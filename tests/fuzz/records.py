@@ -22,7 +22,7 @@ from ihbench.record.index import Index
 from ihbench.record.reopen import reopen_body, reopen_capture, reopen_protocol
 from ihbench.record.results import read_result
 from ihbench.record.store import RunFolder
-from ihbench.reports import ablation
+from ihbench.reports.general import ablation
 from ihbench.run.ablation import Comparison, Ladder, Rung
 from ihbench.run.cells import Cell, CellOutcome
 from ihbench.run.shared_states import lend, lender

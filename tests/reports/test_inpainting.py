@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from ihbench.record.results import RunResult
-from ihbench.reports.inpainting import inpainting_section
-from ihbench.reports.markdown import markdown
+from ihbench.reports.general.inpainting import inpainting_section
+from ihbench.reports.general.markdown import markdown
 
 
 def event(delta_e, views=3):

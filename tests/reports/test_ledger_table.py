@@ -9,8 +9,8 @@ import pytest
 from ihbench.clock.ledger import Ledger
 from ihbench.files.atomic import read_json
 from ihbench.record.results import RunResult, read_result
-from ihbench.reports.ledger_table import TOLERANCE, account, ledger_section
-from ihbench.reports.markdown import markdown
+from ihbench.reports.general.ledger_table import TOLERANCE, account, ledger_section
+from ihbench.reports.general.markdown import markdown
 from tests.reports.made_up_runs import made_up
 
 

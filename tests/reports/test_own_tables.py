@@ -10,13 +10,14 @@ import pytest
 
 from ihbench.errors import BadInput
 from ihbench.record.row_choice import Choice
-from ihbench.reports import html, latex, markdown, table_html, table_latex, table_markdown
-from ihbench.reports.metric_names import head_metric
-from ihbench.reports.paper_numbers import paper_table
-from ihbench.reports.paper_table import build_frame
-from ihbench.reports.short_names import split_label, with_short_names
-from ihbench.reports.table_lint import lint
-from ihbench.reports.table_reading import read_tables
+from ihbench.reports.general import html, latex, markdown
+from ihbench.reports.general.short_names import split_label, with_short_names
+from ihbench.reports.lint.metric_names import head_metric
+from ihbench.reports.lint.table_lint import lint
+from ihbench.reports.lint.table_reading import read_tables
+from ihbench.reports.paper import table_html, table_latex, table_markdown
+from ihbench.reports.paper.paper_numbers import paper_table
+from ihbench.reports.paper.paper_table import build_frame
 from tests.reports.fake_runs import SUBJECTS, fake_run
 from tests.reports.made_up_runs import FLIP, PSNR, made_up, sweep
 from tests.reports.test_ablation import rung, told
@@ -185,7 +186,7 @@ def test_in_markdown_and_on_pages_only_long_names_are_cut(tmp_path):
 
 
 def test_one_text_has_one_letter_in_a_document():
-    from ihbench.reports.document import Table
+    from ihbench.document.document import Table
 
     tables = [Table(("method",), (("m (a=1)",), ("n (b=2)",))), Table(("method",), (("n (b=2)",), ("m (c=3)",)))]
     found = with_short_names(tables)

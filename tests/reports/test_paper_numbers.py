@@ -9,7 +9,7 @@ import pytest
 
 from ihbench import registry
 from ihbench.errors import BadInput
-from ihbench.reports.paper_numbers import Digits, paper_table
+from ihbench.reports.paper.paper_numbers import Digits, paper_table
 
 
 def row(table, name):

@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from ihbench.reports.paper_numbers import paper_table
-from ihbench.reports.paper_table import build_frame
+from ihbench.reports.paper.paper_numbers import paper_table
+from ihbench.reports.paper.paper_table import build_frame
 from tests.reports.fake_runs import LPIPS, PSNR, SUBJECTS, fake_run
 
 TABLE1, TABLE2 = paper_table("table1"), paper_table("table2")

@@ -11,12 +11,12 @@ import pytest
 
 from ihbench.metrics.statistics import Interval
 from ihbench.record.quality_time import Target
-from ihbench.reports.configurations import configurations, sweeps
-from ihbench.reports.figures import ROOM, _shown, draw
-from ihbench.reports.html import write as html_write
-from ihbench.reports.latex import write as latex_write
-from ihbench.reports.markdown import markdown, write
-from ihbench.reports.run_time import across_sizes_section, run_time_section, work_points
+from ihbench.reports.general.configurations import configurations, sweeps
+from ihbench.reports.general.figures import ROOM, _shown, draw
+from ihbench.reports.general.html import write as html_write
+from ihbench.reports.general.latex import write as latex_write
+from ihbench.reports.general.markdown import markdown, write
+from ihbench.reports.general.run_time import across_sizes_section, run_time_section, work_points
 from tests.reports.made_up_runs import FLIP, PSNR, made_up, sweep
 
 IDENTITIES = [PSNR.format("body"), FLIP.format("body")]

@@ -11,11 +11,11 @@ from html.parser import HTMLParser
 
 import pytest
 
-from ihbench.reports import table_data, table_latex, table_markdown
-from ihbench.reports.paper_numbers import paper_table
-from ihbench.reports.paper_table import build_frame
-from ihbench.reports.table_html import write as write_html
-from ihbench.reports.table_reading import read_tables
+from ihbench.reports.lint.table_reading import read_tables
+from ihbench.reports.paper import table_data, table_latex, table_markdown
+from ihbench.reports.paper.paper_numbers import paper_table
+from ihbench.reports.paper.paper_table import build_frame
+from ihbench.reports.paper.table_html import write as write_html
 from tests.reports.fake_runs import SUBJECTS, fake_run
 
 NASTY = '<b>x</b> & 50% | $a_b$ #1 ~^ {c} \\d *e* `f` [g] "h" 人'

@@ -7,11 +7,11 @@ import random
 
 import pytest
 
-from ihbench.reports import table_latex, table_markdown
-from ihbench.reports.paper_numbers import paper_table
-from ihbench.reports.paper_table import build_frame
-from ihbench.reports.table_lint import lint
-from ihbench.reports.table_reading import read_tables
+from ihbench.reports.lint.table_lint import lint
+from ihbench.reports.lint.table_reading import read_tables
+from ihbench.reports.paper import table_latex, table_markdown
+from ihbench.reports.paper.paper_numbers import paper_table
+from ihbench.reports.paper.paper_table import build_frame
 from tests.reports.fake_runs import SUBJECTS, fake_run
 
 BOLD = {"md": "**{}**", "tex": r"\textbf{{{}}}"}

@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ihbench.errors import BadInput
-from ihbench.reports.latex_reading import latex_grids
-from ihbench.reports.markdown_reading import markdown_grids
-from ihbench.reports.metric_names import head_metric
-from ihbench.reports.table_reading import read_tables, tables_of
+from ihbench.reports.lint.latex_reading import latex_grids
+from ihbench.reports.lint.markdown_reading import markdown_grids
+from ihbench.reports.lint.metric_names import head_metric
+from ihbench.reports.lint.table_reading import read_tables, tables_of
 
 
 def latex(body, spec="lcc", before="", after=""):

@@ -15,10 +15,11 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from ihbench.document import diagram
+from ihbench.document.document import Bullets, Heading, Paragraph, Table, code, strong
 from ihbench.errors import BadInput, Diverged
-from ihbench.reports import html, latex, markdown, table_html
-from ihbench.reports.content import general_report
-from ihbench.reports.document import Bullets, Heading, Paragraph, Table, code, strong
+from ihbench.reports.general import html, latex, markdown
+from ihbench.reports.general.content import general_report
+from ihbench.reports.paper import table_html
 from tests.reports.made_up_runs import made_up
 
 NASTY = r"""<script>alert(1)</script> & "x" 'y' \write18{rm} $a_b^c$ 100% #1 {~} | `q` ]( ↑ 文"""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from ihbench.reports.html import POLICY, STYLE, escape
-from ihbench.reports.paper_table import Block, Cell, Frame, Row
+from ihbench.reports.general.html import POLICY, STYLE, escape
+from ihbench.reports.paper.paper_table import Block, Cell, Frame, Row
 
 MARKS = {"best": "<strong>{}</strong>", "second": "<u>{}</u>", "": "{}"}
 OWN_STYLE = """

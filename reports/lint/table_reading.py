@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ihbench.errors import BadInput
 from ihbench.files.regular import read_text
-from ihbench.reports.metric_names import HeadMetric, head_metric
+from ihbench.reports.lint.metric_names import HeadMetric, head_metric
 
 LARGEST_FILE = 4 * 2**20  # bytes
 NUM = r"[-+−]?(?:\d{1,3}(?:,\d{3})+(?:\.\d+)?|\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
@@ -137,8 +137,8 @@ def read_tables(path: Path) -> Reading:
 
     Raises `BadInput` for a file that is missing, too large, not text, of another kind, or without any table.
     """
-    from ihbench.reports.latex_reading import latex_grids
-    from ihbench.reports.markdown_reading import markdown_grids
+    from ihbench.reports.lint.latex_reading import latex_grids
+    from ihbench.reports.lint.markdown_reading import markdown_grids
 
     readers = {".tex": latex_grids, ".md": markdown_grids, ".markdown": markdown_grids}
     reader = readers.get(path.suffix.lower())

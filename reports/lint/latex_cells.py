@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, field
 
-from ihbench.reports.table_reading import Style, Styled
+from ihbench.reports.lint.table_reading import Style, Styled
 
 DEEPEST = 60  # nested groups and macros
 LONGEST = 20_000  # characters of a cell, its macros replaced

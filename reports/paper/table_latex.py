@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from ihbench.errors import visible
-from ihbench.reports.latex import NEEDS, PREAMBLE, escape
-from ihbench.reports.paper_table import Block, Cell, Frame, Row
+from ihbench.reports.general.latex import NEEDS, PREAMBLE, escape
+from ihbench.reports.paper.paper_table import Block, Cell, Frame, Row
 
 MARKS = {"best": r"\textbf{%s}", "second": r"\underline{%s}", "": "%s"}
 PAIRED = "% ihbench lint: paired"  # tells the linter that marks come from paired differences

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ihbench.reports.markdown import plain
-from ihbench.reports.paper_table import Block, Cell, Frame, Row
+from ihbench.reports.general.markdown import plain
+from ihbench.reports.paper.paper_table import Block, Cell, Frame, Row
 
 MARKS = {"best": "**{}**", "second": "<u>{}</u>", "": "{}"}
 PAIRED = "<!-- ihbench lint: paired -->"  # tells the linter that marks come from paired differences

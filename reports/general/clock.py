@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ihbench.clock.machine import BUSY
+from ihbench.document.document import Words
 from ihbench.record.results import RunResult
 from ihbench.record.row_labels import by_label
-from ihbench.reports.document import Words
 
 UNSTABLE = 0.25  # repeats further apart than this share of their median are called unstable, as in `ihbench kernels`
 

@@ -17,10 +17,10 @@ from ihbench.metrics.statistics import Interval, mean_interval
 from ihbench.record.results import RunResult, group_row
 from ihbench.record.row_choice import EVERYTHING, Choice
 from ihbench.record.row_labels import by_label
-from ihbench.reports.marks import marks_by_interval, marks_by_value
-from ihbench.reports.paper_numbers import Column, Component, Group, PaperTable
-from ihbench.reports.short_names import Footnotes, split_label
-from ihbench.reports.significance import LEVEL, scene_means
+from ihbench.reports.general.short_names import Footnotes, split_label
+from ihbench.reports.general.significance import LEVEL, scene_means
+from ihbench.reports.paper.marks import marks_by_interval, marks_by_value
+from ihbench.reports.paper.paper_numbers import Column, Component, Group, PaperTable
 from ihbench.scene.protocol import REGIONS
 from ihbench.score.calibration import DESCRIPTIONS, ROWS
 

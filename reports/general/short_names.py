@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
-from ihbench.reports.document import Block, Paragraph, Span, Table
+from ihbench.document.document import Block, Paragraph, Span, Table
 
 LABEL = re.compile(r"(?P<method>.+?) \((?P<words>.+)\)(?P<rest>(?: on [A-Z]\d*| \[[^\]]*\])*)", re.DOTALL)
 NEXT = re.compile(r", (?=[\w.]+=|only |code |predictions|\d+ views )")  # between the words in brackets of a label

@@ -11,6 +11,7 @@ from statistics import median
 
 import numpy as np
 
+from ihbench.document.document import Block, Heading, Paragraph, Table, Words, bullets
 from ihbench.metrics import Identity
 from ihbench.metrics.identity import metric_of
 from ihbench.metrics.statistics import Interval, mean_interval, median_interval
@@ -27,10 +28,9 @@ from ihbench.record.quality_time import (
     time_to_quality,
 )
 from ihbench.record.results import RunResult
-from ihbench.reports.clock import clock_notes
-from ihbench.reports.configurations import Configuration, configurations
-from ihbench.reports.document import Block, Heading, Paragraph, Table, Words, bullets
-from ihbench.reports.significance import LEVEL, per_scene
+from ihbench.reports.general.clock import clock_notes
+from ihbench.reports.general.configurations import Configuration, configurations
+from ihbench.reports.general.significance import LEVEL, per_scene
 
 ON_THE_CURVE = ("psnr", "flip")  # targets are chosen for these where none is stated
 SPREAD = f"{LEVEL:.0%}"

@@ -8,14 +8,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from ihbench.document.document import Block, Bullets, Heading, Paragraph, Picture, Table, Words, spans
 from ihbench.errors import visible
 from ihbench.record.quality_time import Target
 from ihbench.record.results import RunResult
-from ihbench.reports.content import general_report, score_tables
-from ihbench.reports.document import Block, Bullets, Heading, Paragraph, Picture, Table, Words, spans
-from ihbench.reports.figures import draw
-from ihbench.reports.run_pictures import run_pictures
-from ihbench.reports.short_names import LONG, with_short_names
+from ihbench.reports.general.content import general_report, score_tables
+from ihbench.reports.general.figures import draw
+from ihbench.reports.general.run_pictures import run_pictures
+from ihbench.reports.general.short_names import LONG, with_short_names
 
 TAGS = {"strong": "strong", "emphasis": "em", "code": "code", "raised": "sup"}
 # even if something slipped through the escaping, a browser that obeys this neither runs it nor loads anything

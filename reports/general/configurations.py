@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ihbench.record.results import RunResult
-from ihbench.reports.clock import by_machine
+from ihbench.reports.general.clock import by_machine
 
 IMAGE_SIZE = "image size"
 PROFILE = "profile"

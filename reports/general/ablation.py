@@ -13,8 +13,8 @@ from ihbench.metrics import Identity
 from ihbench.metrics.identity import Metric, metric_of
 from ihbench.metrics.statistics import Interval, holm, mean_interval, paired_test
 from ihbench.record.results import RunResult
-from ihbench.reports.clock import clock_notes, one_clock
-from ihbench.reports.significance import ALPHA, LEVEL, per_scene
+from ihbench.reports.general.clock import clock_notes, one_clock
+from ihbench.reports.general.significance import ALPHA, LEVEL, per_scene
 from ihbench.run.ablation import Comparison, Ladder
 from ihbench.run.cells import CellOutcome
 

@@ -12,8 +12,8 @@ from ihbench.metrics import Identity, macro_mean
 from ihbench.metrics.identity import metric_of
 from ihbench.record.results import TRACEBACK, RunResult
 from ihbench.record.row_labels import by_label
-from ihbench.reports.clock import one_clock
-from ihbench.reports.significance import scene_means
+from ihbench.reports.general.clock import one_clock
+from ihbench.reports.general.significance import scene_means
 from ihbench.score.calibration import ROWS
 
 WIDTH = 80

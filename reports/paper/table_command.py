@@ -58,8 +58,8 @@ class TableCommand:
     def main(self, argv: list[str]) -> int:
         chosen = options(TableOptions, argv, f"report {self.name}", self.summary)
         from ihbench.record.row_choice import Choice
-        from ihbench.reports.paper_numbers import paper_table
-        from ihbench.reports.paper_table import build_frame
+        from ihbench.reports.paper.paper_numbers import paper_table
+        from ihbench.reports.paper.paper_table import build_frame
 
         if chosen.region and chosen.regions:
             raise BadInput("--region and --regions: give one of them")
@@ -79,7 +79,7 @@ class TableCommand:
 def _writer(name: str, fragment: bool) -> Callable[..., str]:
     """Imported when asked for: a page or a document brings more than a CSV file needs."""
     if name in ("csv", "json"):
-        from ihbench.reports.table_data import write_csv, write_json
+        from ihbench.reports.paper.table_data import write_csv, write_json
 
         if fragment:
             raise BadInput(f"--fragment: {name} has no document around it; leave it out, or take tex, md or html")

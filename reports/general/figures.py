@@ -19,8 +19,8 @@ from ihbench.record import outputs
 from ihbench.record.quality_time import QualityCurve, error_of, pareto_set
 from ihbench.record.results import RunResult
 from ihbench.record.store import plain_name
-from ihbench.reports.configurations import Configuration, configurations, short_value, sweeps
-from ihbench.reports.run_time import (
+from ihbench.reports.general.configurations import Configuration, configurations, short_value, sweeps
+from ihbench.reports.general.run_time import (
     LEVEL,
     WorkPoint,
     comparable,

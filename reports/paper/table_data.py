@@ -10,7 +10,7 @@ from typing import Any
 
 from ihbench.document.diagram import harmless
 from ihbench.files import atomic
-from ihbench.reports.paper_table import Block, Cell, Frame, Row
+from ihbench.reports.paper.paper_table import Block, Cell, Frame, Row
 
 FIELDS: tuple[str, ...] = (
     "table", "block", "kind", "row", "section", "calibration", "group", "metric", "unit", "text", "value", "low",

@@ -6,9 +6,9 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, TypedDict
 
+from ihbench.document.document import Block, Heading, Paragraph, Table, Words, bullets
 from ihbench.record.results import RunResult
 from ihbench.record.shape import Within, fault
-from ihbench.reports.document import Block, Heading, Paragraph, Table, Words, bullets
 
 EVENT = "inpainted"
 Measured = Annotated[float, Within(nan=True, infinite=True)] | None

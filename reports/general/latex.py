@@ -6,12 +6,12 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
+from ihbench.document.document import Block, Bullets, Heading, Paragraph, Picture, Table, Words, spans
 from ihbench.errors import visible
 from ihbench.record.quality_time import Target
 from ihbench.record.results import RunResult
-from ihbench.reports.content import general_report, score_tables
-from ihbench.reports.document import Block, Bullets, Heading, Paragraph, Picture, Table, Words, spans
-from ihbench.reports.short_names import with_short_names
+from ihbench.reports.general.content import general_report, score_tables
+from ihbench.reports.general.short_names import with_short_names
 
 PREAMBLE = r"""\documentclass[10pt]{article}
 \usepackage[T1]{fontenc}

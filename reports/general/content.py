@@ -6,14 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from ihbench.errors import BadInput
-from ihbench.metrics import Identity, Mean, macro_mean
-from ihbench.metrics.identity import metric_of
-from ihbench.record.quality_time import Target
-from ihbench.record.results import RunResult
-from ihbench.record.row_labels import by_label
-from ihbench.reports.clock import one_clock
-from ihbench.reports.document import (
+from ihbench.document.document import (
     Block,
     Bullets,
     Heading,
@@ -26,10 +19,17 @@ from ihbench.reports.document import (
     emphasis,
     strong,
 )
-from ihbench.reports.inpainting import inpainting_section
-from ihbench.reports.ledger_table import ledger_section
-from ihbench.reports.run_time import across_sizes_section, run_time_section
-from ihbench.reports.significance import intervals_section
+from ihbench.errors import BadInput
+from ihbench.metrics import Identity, Mean, macro_mean
+from ihbench.metrics.identity import metric_of
+from ihbench.record.quality_time import Target
+from ihbench.record.results import RunResult
+from ihbench.record.row_labels import by_label
+from ihbench.reports.general.clock import one_clock
+from ihbench.reports.general.inpainting import inpainting_section
+from ihbench.reports.general.ledger_table import ledger_section
+from ihbench.reports.general.run_time import across_sizes_section, run_time_section
+from ihbench.reports.general.significance import intervals_section
 from ihbench.score.calibration import DESCRIPTIONS, ROWS
 
 Rows = dict[str, dict[str, Mean]]  # of one run: row -> identity -> mean

@@ -12,8 +12,8 @@ from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
-from ihbench.reports.latex_cells import LONGEST, Macros, after_optional, closing, show
-from ihbench.reports.table_reading import PAIRED, Grid, GridRow, ReadCell, Styled, blanked, read_cell
+from ihbench.reports.lint.latex_cells import LONGEST, Macros, after_optional, closing, show
+from ihbench.reports.lint.table_reading import PAIRED, Grid, GridRow, ReadCell, Styled, blanked, read_cell
 
 TABULARS = (
     "tabular", "tabular*", "tabularx", "tabulary", "longtable", "xltabular", "supertabular", "tabu", "longtabu",

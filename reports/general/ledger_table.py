@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from datetime import datetime
 
 from ihbench.clock.ledger import in_order
+from ihbench.document.document import Block, Heading, Paragraph, Table, Words, bullets, emphasis, strong
 from ihbench.record.results import RunResult
-from ihbench.reports.clock import by_machine
-from ihbench.reports.document import Block, Heading, Paragraph, Table, Words, bullets, emphasis, strong
+from ihbench.reports.general.clock import by_machine
 
 TOLERANCE = 0.02  # of the wall clock, that stages may leave unnamed
 STAMPED = 2.0  # s; the record's time stamps are whole seconds at both ends

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from html import unescape
 
-from ihbench.reports.latex_cells import show
-from ihbench.reports.table_reading import PAIRED, Grid, GridRow, Style, Styled, blanked, read_cell
+from ihbench.reports.lint.latex_cells import show
+from ihbench.reports.lint.table_reading import PAIRED, Grid, GridRow, Style, Styled, blanked, read_cell
 
 RULE = re.compile(r"\s*\|?\s*:?-+:?\s*(\|\s*:?-+:?\s*)*\|?\s*")
 FENCE = re.compile(r"\s*(```+|~~~+)")

@@ -8,11 +8,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
+from ihbench.document.document import Block, Heading, Paragraph, Table, Words, bullets
 from ihbench.metrics import Identity, Mean, macro_mean
 from ihbench.metrics.identity import Metric, metric_of
 from ihbench.metrics.statistics import holm, mean_interval, paired_test, smallest_detectable_difference
 from ihbench.record.results import RunResult
-from ihbench.reports.document import Block, Heading, Paragraph, Table, Words, bullets
 
 LEVEL = 0.95
 ALPHA = 0.05

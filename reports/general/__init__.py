@@ -1,0 +1,1 @@
+"""The general report of finished runs."""

@@ -1,0 +1,1 @@
+"""Finds wrong marks, arrows, units and claims in tables."""
