@@ -135,7 +135,7 @@ def paper_table(name: str, file: Path | None = None) -> PaperTable:
     """
     where = str(file or "paper_tables.toml")
     try:
-        shipped = files("ihbench.reports") / "paper_tables.toml"
+        shipped = files("ihbench.reports.paper") / "paper_tables.toml"
         content = tomllib.loads(shipped.read_text(encoding="utf-8")) if file is None else read_toml(file, "tables")
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise BadInput(f"{where}: cannot be read ({error})") from error

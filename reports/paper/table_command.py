@@ -84,7 +84,7 @@ def _writer(name: str, fragment: bool) -> Callable[..., str]:
         if fragment:
             raise BadInput(f"--fragment: {name} has no document around it; leave it out, or take tex, md or html")
         return write_csv if name == "csv" else write_json
-    module = import_module(f"ihbench.reports.table_{FORMATS[name]}")
+    module = import_module(f"ihbench.reports.paper.table_{FORMATS[name]}")
     return module.fragment if fragment else module.write
 
 
