@@ -67,7 +67,7 @@ OF_THE_BENCH = [
     ),
     *("protocols/occlusion.py", "datasets/zju_mocap/original.py", "datasets/reading/capture_folder.py"),
 ]
-OF_THE_METHOD = ["methods/inpainthuman/stages/stage1.py", "ihbench/diffusion/sampling.py"]
+OF_THE_METHOD = ["methods/inpainthuman/stages/stage1.py", "methods/inpainthuman/inpainting/shown_view.py"]
 OF_NO_NUMBER = [
     *("ihbench/cli.py", "ihbench/commands/run.py", "ihbench/kernels/splats.py", "ihbench/stress/splat.py"),
     *(
