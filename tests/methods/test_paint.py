@@ -9,7 +9,7 @@ import pytest
 from ihbench.diffusion.mini.weights import save_mini
 from ihbench.methods.inpainthuman.studies.paint_rows import FULL
 from ihbench.methods.inpainthuman.studies.paint_table import summary, table
-from tests.methods.tiny_diffusion import tiny_backbone
+from tests.diffusion.tiny_diffusion import tiny_backbone
 
 
 @pytest.fixture(scope="module")

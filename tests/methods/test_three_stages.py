@@ -24,8 +24,8 @@ from ihbench.metrics.ssim import ssim_map
 from ihbench.run.run_loop import RunRequest, _outside
 from ihbench.scene.protocol import load_protocol
 from tests.bench.fake_capture import a_camera, a_pose, the_body, train_view
-from tests.methods.sd2_miniature import make_miniature
-from tests.methods.tiny_diffusion import tiny_backbone
+from tests.diffusion.sd2_miniature import make_miniature
+from tests.diffusion.tiny_diffusion import tiny_backbone
 from tests.methods.tiny_fit import SIZE, TINY, equal_bits, parameters_of, training_set
 
 QUIET = Progress.silent()

@@ -26,7 +26,7 @@ from ihbench.diffusion.mini.training import MiniTraining
 from ihbench.diffusion.mini.weights import load_mini, save_mini
 from ihbench.errors import BadInput
 from tests.conftest import contents
-from tests.methods.tiny_diffusion import same, tiny_backbone, weights
+from tests.diffusion.tiny_diffusion import same, tiny_backbone, weights
 
 QUIET = Progress.silent()
 SIDE = 64  # px

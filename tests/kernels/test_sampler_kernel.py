@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ihbench.kernels.sampler import hidden_middle, sampler_rows
-from tests.methods.tiny_diffusion import CROP, same, tiny_backbone, weights
+from tests.diffusion.tiny_diffusion import CROP, same, tiny_backbone, weights
 
 
 def test_as_many_steps_as_the_reference_differ_by_rounding_alone_and_fewer_by_more():

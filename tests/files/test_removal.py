@@ -21,8 +21,8 @@ from ihbench.record import store
 from ihbench.record.store import RunFolder
 from ihbench.scene.views import open_scene
 from tests.bench.fake_capture import fake_protocol, the_body, turning_capture
-from tests.bench.test_store import IDENTITY
 from tests.conftest import contents
+from tests.record.test_store import IDENTITY
 
 ROOT = Path(removal.__file__).parents[1]
 

@@ -29,7 +29,7 @@ from ihbench.diffusion.sampling import sample
 from ihbench.diffusion.sd2_weights import load_sd2
 from ihbench.diffusion.subject_token import SubjectToken
 from ihbench.errors import BadInput
-from tests.methods.sd2_miniature import make_miniature, write_json
+from tests.diffusion.sd2_miniature import make_miniature, write_json
 
 UNET_FILE = "unet/diffusion_pytorch_model.safetensors"
 VAE_FILE = "vae/diffusion_pytorch_model.safetensors"

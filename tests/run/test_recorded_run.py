@@ -13,7 +13,7 @@ from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.record.store import RunFolder
 from ihbench.run.recorded_run import RecordedRun, recorded
-from tests.bench.test_store import IDENTITY
+from tests.record.test_store import IDENTITY
 
 
 class OneStage(RecordedRun):

@@ -22,14 +22,14 @@ from ihbench.record.index import Index
 from ihbench.record.results import read_result
 from ihbench.record.store import KILLED, RunFolder
 from ihbench.run.recorded_run import RecordedRun, recorded
-from tests.bench.test_store import IDENTITY
+from tests.record.test_store import IDENTITY
 
 # a run that waits for its end, as `ihbench run` makes one
 WAITS = """\
 import sys, time
 from pathlib import Path
 from ihbench import cli; from ihbench.run import recorded_run
-from tests.bench.test_store import IDENTITY
+from tests.record.test_store import IDENTITY
 
 class Waits(recorded_run.RecordedRun):
     def work(self):
@@ -54,7 +54,7 @@ from ihbench.run.cells import Cell, run_cells
 from ihbench.clock.progress import Progress
 
 def child(connection, request, source, scene, threads):
-    from tests.bench.test_interruption import hold
+    from tests.clock.test_interruption import hold
     hold(Path(request), scene)
 
 cells._child = child

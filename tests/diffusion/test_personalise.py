@@ -17,7 +17,7 @@ from ihbench.diffusion.inpaint_config import InpaintConfig
 from ihbench.diffusion.personalise import Personaliser, best_seen
 from ihbench.diffusion.subject_token import ANYBODY, SubjectToken
 from ihbench.errors import BadInput, Diverged
-from tests.methods.tiny_diffusion import crops, images_equal, same, tiny_backbone, weights
+from tests.diffusion.tiny_diffusion import crops, images_equal, same, tiny_backbone, weights
 
 QUIET = Progress.silent()
 TINY = InpaintConfig(ti_steps=3, lora_steps=3, batch=2, sampler_steps=2)

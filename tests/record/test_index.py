@@ -19,7 +19,7 @@ from ihbench.record import index
 from ihbench.record.index import Index
 from ihbench.record.results import read_result
 from ihbench.record.store import RunFolder
-from tests.bench.test_store import IDENTITY
+from tests.record.test_store import IDENTITY
 from tests.reports.fake_runs import about
 
 PSNR = "psnr/pooled/range1/body/v1"
