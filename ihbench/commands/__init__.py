@@ -1,1 +1,19 @@
 """One module per command: its options as a frozen dataclass, and `main(argv) -> exit status`."""
+
+COMMANDS = {
+    "run": "fit a method under a protocol, score it, print the table (the main job)",
+    "list": "what is registered: methods, datasets, protocols, reports, metrics",
+    "protocol": "show every choice of a protocol, or where two differ",
+    "plan": "what a run would do, what it leaves out and why; runs nothing",
+    "data": "check a data folder, or write a stand-in capture",
+    "score": "score a folder of images that somebody else's code rendered",
+    "prepare": "hand out the occluded training set for other people's code",
+    "ablate": "what each component of a method is worth, in quality and in seconds",
+    "report": "tables of finished runs, and error against run time",
+    "runs": "list the runs in a folder, one line each; remove some",
+    "metrics": "check every metric against oracles, other libraries and stored values",
+    "weights": "learned weights the bench may not ship: list, where, fetch",
+    "export": "an avatar's Gaussians as a splat PLY",
+    "stress": "stiff and extreme cases with known answers, case by case",
+    "kernels": "error against milliseconds for the bench's own kernels",
+}

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import tyro
 
 from ihbench import registry
-from ihbench.cli import COMMANDS
+from ihbench.commands import COMMANDS
 from ihbench.commands.parse import options
 from ihbench.errors import BadInput
 from ihbench.files.regular import read_toml

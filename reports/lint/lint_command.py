@@ -28,7 +28,7 @@ def main(argv: list[str]) -> int:
     """Print one line for each finding; status 1 if there are any. What was not understood goes to stderr."""
     chosen = options(LintOptions, argv, "report lint", SUMMARY)
     from ihbench.reports.lint.table_lint import lint, unknown_heads
-    from ihbench.reports.lint.table_reading import read_tables
+    from ihbench.reports.lint.table_files import read_tables
 
     if not chosen.file:
         raise BadInput("report lint: which file? give one or more .tex or .md files")

@@ -24,7 +24,7 @@ from tests.bench.fake_capture import fake_protocol, the_body, turning_capture
 from tests.conftest import contents
 from tests.record.test_store import IDENTITY
 
-ROOT = Path(removal.__file__).parents[1]
+ROOT = Path(removal.__file__).parents[2]
 
 
 # ----------------------------------------------------------------------------------------------------- in the code

@@ -266,7 +266,7 @@ def test_a_method_of_others_that_is_built_on_ours_counts_ours(checkout, tmp_path
     monkeypatch.setattr(registry, "_found", lambda k: found(k) | ({"theirs": points[k]} if k in points else {}))
     monkeypatch.setattr(registry, "source", lambda kind, name: package if name == "theirs" else source(kind, name))
     before = code_of(load_protocol("zju_occ"), "theirs")
-    stage = checkout / "methods" / "inpainthuman" / "stage1.py"
+    stage = checkout / "methods" / "inpainthuman" / "stages" / "stage1.py"
     text = stage.read_text()
     stage.write_text(text + "\nx = 1\n")
     source_digest._known.pop(str(stage), None)

@@ -12,7 +12,8 @@ from ihbench.errors import BadInput
 from ihbench.reports.lint.latex_reading import latex_grids
 from ihbench.reports.lint.markdown_reading import markdown_grids
 from ihbench.reports.lint.metric_names import head_metric
-from ihbench.reports.lint.table_reading import read_tables, tables_of
+from ihbench.reports.lint.table_files import read_tables
+from ihbench.reports.lint.table_reading import tables_of
 
 
 def latex(body, spec="lcc", before="", after=""):
