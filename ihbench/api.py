@@ -17,9 +17,9 @@ import numpy as np
 from ihbench import bounds, registry
 from ihbench.bounds import SEEDS
 from ihbench.clock.progress import Progress
-from ihbench.commands.device import check_device
-from ihbench.commands.keep import check_keep
-from ihbench.commands.scene_choice import OcclusionChoice, ProtocolChanges
+from ihbench.commands.options.device import check_device
+from ihbench.commands.options.keep import check_keep
+from ihbench.commands.options.scene_choice import OcclusionChoice, ProtocolChanges
 from ihbench.errors import BadInput
 from ihbench.files.paths import user_path
 from ihbench.record.results import RunResult

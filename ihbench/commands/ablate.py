@@ -13,10 +13,10 @@ import tyro
 from ihbench import registry
 from ihbench.bounds import SEEDS, Within, refuse_repeated
 from ihbench.clock.gpu_slots import card_slots, free_memory
-from ihbench.commands.device import check_device
-from ihbench.commands.keep import check_keep
-from ihbench.commands.parse import options
-from ihbench.commands.scene_choice import SceneChoice
+from ihbench.commands.options.device import check_device
+from ihbench.commands.options.keep import check_keep
+from ihbench.commands.options.parse import options
+from ihbench.commands.options.scene_choice import SceneChoice
 from ihbench.errors import BadInput
 
 if TYPE_CHECKING:

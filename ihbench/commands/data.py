@@ -12,7 +12,7 @@ import tyro
 
 from ihbench import registry
 from ihbench.bounds import LARGEST_CAST, SEEDS, Within
-from ihbench.commands.parse import options
+from ihbench.commands.options.parse import options
 from ihbench.errors import BadInput
 
 

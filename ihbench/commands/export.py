@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from ihbench.bounds import WHOLE, whole
-from ihbench.commands.parse import options
+from ihbench.commands.options.parse import options
 from ihbench.errors import BadInput
 from ihbench.version import __version__
 

@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from ihbench.bounds import Within
-from ihbench.commands.parse import options
+from ihbench.commands.options.parse import options
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import tyro
 
 from ihbench import registry
 from ihbench.commands import COMMANDS
-from ihbench.commands.parse import options
+from ihbench.commands.options.parse import options
 from ihbench.errors import BadInput
 from ihbench.files.regular import read_toml
 from ihbench.scene.protocol import load_protocol

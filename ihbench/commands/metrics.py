@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from ihbench.clock import streams
-from ihbench.commands.parse import options
+from ihbench.commands.options.parse import options
 
 if TYPE_CHECKING:
     from ihbench.metrics.oracles.check import Comparison

@@ -8,8 +8,8 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from ihbench import registry
-from ihbench.commands.parse import options
-from ihbench.commands.scene_choice import SceneChoice
+from ihbench.commands.options.parse import options
+from ihbench.commands.options.scene_choice import SceneChoice
 from ihbench.errors import BadInput
 
 if TYPE_CHECKING:

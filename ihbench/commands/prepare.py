@@ -7,8 +7,8 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
-from ihbench.commands.parse import options
-from ihbench.commands.scene_choice import ProtocolChanges
+from ihbench.commands.options.parse import options
+from ihbench.commands.options.scene_choice import ProtocolChanges
 from ihbench.errors import BadInput
 
 OWN_LAYOUT = {

@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from ihbench.commands.parse import options
-from ihbench.commands.scene_choice import ProtocolChanges
+from ihbench.commands.options.parse import options
+from ihbench.commands.options.scene_choice import ProtocolChanges
 from ihbench.scene.occlusion import withheld
 from ihbench.scene.protocol import Protocol, difference, flatten, load_protocol
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from ihbench import registry
-from ihbench.commands.parse import options
+from ihbench.commands.options.parse import options
 from ihbench.errors import BadInput, visible
 from ihbench.files import atomic
 from ihbench.record import outputs

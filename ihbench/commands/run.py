@@ -11,11 +11,11 @@ import tyro
 
 from ihbench import registry
 from ihbench.bounds import SEEDS, refuse_repeated
-from ihbench.commands.device import check_device
-from ihbench.commands.keep import check_keep
-from ihbench.commands.parse import options
+from ihbench.commands.options.device import check_device
+from ihbench.commands.options.keep import check_keep
+from ihbench.commands.options.parse import options
+from ihbench.commands.options.scene_choice import SceneChoice
 from ihbench.commands.report import headline
-from ihbench.commands.scene_choice import SceneChoice
 from ihbench.errors import BadInput
 
 if TYPE_CHECKING:

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ihbench import registry
-from ihbench.commands.parse import options
+from ihbench.commands.options.parse import options
+from ihbench.commands.options.scene_choice import OcclusionChoice, ProtocolChanges
 from ihbench.commands.report import headline
-from ihbench.commands.scene_choice import OcclusionChoice, ProtocolChanges
 from ihbench.errors import BadInput
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from ihbench.commands.device import check_device
+from ihbench.commands.options.device import check_device
 from ihbench.diffusion.mini.training import MiniTraining
 from ihbench.errors import BadInput
 
@@ -33,7 +33,7 @@ class TrainMiniOptions:
 
 
 def main(argv: list[str]) -> int:
-    from ihbench.commands.parse import options
+    from ihbench.commands.options.parse import options
 
     chosen = options(TrainMiniOptions, argv, "train-mini", "Train the small diffusion backbone.")
     result = _train(chosen)

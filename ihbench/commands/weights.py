@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from ihbench.commands.parse import options
+from ihbench.commands.options.parse import options
 from ihbench.metrics import weights
 
 

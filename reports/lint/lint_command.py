@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from ihbench.commands.parse import options
+from ihbench.commands.options.parse import options
 from ihbench.errors import BadInput
 
 SUMMARY = "Wrong marks, missing arrows, mixed units and claims within noise in the tables of .tex and .md files."
@@ -27,8 +27,8 @@ class LintOptions:
 def main(argv: list[str]) -> int:
     """Print one line for each finding; status 1 if there are any. What was not understood goes to stderr."""
     chosen = options(LintOptions, argv, "report lint", SUMMARY)
-    from ihbench.reports.lint.table_lint import lint, unknown_heads
     from ihbench.reports.lint.table_files import read_tables
+    from ihbench.reports.lint.table_lint import lint, unknown_heads
 
     if not chosen.file:
         raise BadInput("report lint: which file? give one or more .tex or .md files")

@@ -7,10 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntFlag
-from pathlib import Path
 
-from ihbench.errors import BadInput
-from ihbench.files.regular import read_text
 from ihbench.reports.lint.metric_names import HeadMetric, head_metric
 
 NUM = r"[-+−]?(?:\d{1,3}(?:,\d{3})+(?:\.\d+)?|\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"

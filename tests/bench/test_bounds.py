@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import pytest
 
 from ihbench.bounds import MultipleOf, Within, check
-from ihbench.commands.parse import options
+from ihbench.commands.options.parse import options
 from ihbench.errors import BadInput
 from ihbench.files.paths import user_path
 

@@ -13,8 +13,8 @@ from ihbench.record.row_choice import Choice
 from ihbench.reports.general import html, latex, markdown
 from ihbench.reports.general.short_names import split_label, with_short_names
 from ihbench.reports.lint.metric_names import head_metric
-from ihbench.reports.lint.table_lint import lint
 from ihbench.reports.lint.table_files import read_tables
+from ihbench.reports.lint.table_lint import lint
 from ihbench.reports.paper import table_html, table_latex, table_markdown
 from ihbench.reports.paper.paper_numbers import paper_table
 from ihbench.reports.paper.paper_table import build_frame

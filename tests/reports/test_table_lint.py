@@ -7,8 +7,8 @@ import random
 
 import pytest
 
-from ihbench.reports.lint.table_lint import lint
 from ihbench.reports.lint.table_files import read_tables
+from ihbench.reports.lint.table_lint import lint
 from ihbench.reports.paper import table_latex, table_markdown
 from ihbench.reports.paper.paper_numbers import paper_table
 from ihbench.reports.paper.paper_table import build_frame

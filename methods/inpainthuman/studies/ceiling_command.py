@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from ihbench.bounds import Within
-from ihbench.commands.device import check_device
+from ihbench.commands.options.device import check_device
 from ihbench.errors import BadInput
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ class CeilingOptions:
 
 
 def main(argv: list[str]) -> int:
-    from ihbench.commands.parse import options
+    from ihbench.commands.options.parse import options
 
     return _ceiling(options(CeilingOptions, argv, "ceiling", f"Measure {SUMMARY}."))
 

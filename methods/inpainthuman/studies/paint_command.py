@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from ihbench.bounds import SEEDS, Within, refuse_repeated
-from ihbench.commands.device import check_device
-from ihbench.commands.scene_choice import ProtocolChanges
+from ihbench.commands.options.device import check_device
+from ihbench.commands.options.scene_choice import ProtocolChanges
 from ihbench.diffusion.inpaint_config import InpaintConfig
 from ihbench.errors import BadInput
 from ihbench.methods.inpainthuman.studies.paint_rows import ROWS
@@ -49,7 +49,7 @@ class PaintOptions(ProtocolChanges):
 
 
 def main(argv: list[str]) -> int:
-    from ihbench.commands.parse import options
+    from ihbench.commands.options.parse import options
 
     chosen = options(PaintOptions, argv, "paint", "Compare painters on hidden pixels whose truth is known.")
     return _paint(chosen)
