@@ -71,7 +71,8 @@ class Bench:
     @property
     def environment(self) -> dict[str, str]:
         private = {name: value for name, value in os.environ.items() if not name.startswith("IHBENCH_")}
-        return private | {"IHBENCH_CACHE": str(self.cache), "OMP_NUM_THREADS": str(self.threads)}
+        own = {"IHBENCH_CACHE": str(self.cache), "TORCH_HOME": "/nowhere", "OMP_NUM_THREADS": str(self.threads)}
+        return private | own  # nobody's weights are looked for either
 
     @contextmanager
     def in_its_world(self) -> Iterator[None]:
