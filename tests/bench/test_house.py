@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 CONTENT = ("methods", "datasets", "protocols", "reports")
-HEAVY = ("torch", "cv2", "kornia", "lpips", "diffusers", "transformers", "skimage", "matplotlib")
+HEAVY = ("torch", "cv2", "kornia", "lpips", "diffusers", "transformers", "skimage", "matplotlib", "pandas", "trimesh")
 
 
 def imports(path):
@@ -59,6 +59,7 @@ LIGHT = {
     "list": ["list"],
     "protocol show": ["protocol", "show", "zju_occ"],
     "protocol diff": ["protocol", "diff", "zju_occ", "zju_occ_occnerf"],
+    "plan": ["plan", "--protocol", "zju_occ"],
     "plan help": ["plan", "--help"],
     "run help": ["run", "--help"],
 }
