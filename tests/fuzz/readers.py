@@ -211,7 +211,7 @@ def _copy(kind: str, name: str, file: str) -> Callable[[Path], Any]:
 def _write_paper_tables(path: Path) -> None:
     from importlib.resources import files
 
-    path.write_bytes((files("ihbench.reports") / "paper_tables.toml").read_bytes())
+    path.write_bytes((files("ihbench.reports") / "paper/paper_tables.toml").read_bytes())
 
 
 def _write_state(path: Path) -> None:

@@ -85,7 +85,7 @@ def test_significant_digits_are_those_of_the_papers_columns(value, shown):
 def damaged(tmp_path, old, new):
     from importlib.resources import files
 
-    text = (files("ihbench.reports") / "paper_tables.toml").read_text(encoding="utf-8")
+    text = (files("ihbench.reports") / "paper/paper_tables.toml").read_text(encoding="utf-8")
     assert old in text
     file = tmp_path / "mine.toml"
     file.write_text(text.replace(old, new, 1), encoding="utf-8")
