@@ -100,7 +100,7 @@ def run(
              seed=seed, device=device, force=force, keep=keep, progress=progress),
         dict(image_size=image_size, train_frames=train_frames, test_frames=test_frames), occlusion,
     )  # fmt: skip
-    from ihbench.run.run_loop import RunRequest, configuration, run_scene
+    from ihbench.runner.run_loop import RunRequest, configuration, run_scene
     from ihbench.scene.data_source import locate
 
     check_device(given.device)

@@ -21,8 +21,8 @@ from ihbench.errors import BadInput
 
 if TYPE_CHECKING:
     from ihbench.clock.progress import Progress
-    from ihbench.run.ablation import Ladder
-    from ihbench.run.cells import Cell, CellOutcome
+    from ihbench.runner.ablation import Ladder
+    from ihbench.runner.cells import Cell, CellOutcome
     from ihbench.scene.data_source import DataSource
 
 BETWEEN = ":"  # values of one switch
@@ -83,7 +83,7 @@ def ablated(
     numbers, and how each run ended. The options' own words for both are not read. Raises `BadInput`."""
     from ihbench.clock.machine import usable_cores
     from ihbench.record import outputs
-    from ihbench.run.cells import run_cells
+    from ihbench.runner.cells import run_cells
 
     if not chosen.seed:
         raise BadInput("--seed: expected one number or more")
@@ -117,7 +117,7 @@ def write_out(chosen: AblateOptions, text: str, numbers: dict[str, Any]) -> None
 
 def profile_of(chosen: AblateOptions) -> Any:
     """The method's configuration under the profile. Raises `BadInput`."""
-    from ihbench.run.run_loop import configuration
+    from ihbench.runner.run_loop import configuration
 
     return configuration(chosen.method, chosen.profile, {})
 
@@ -128,7 +128,7 @@ def _ladders(method: str) -> dict[str, Ladder]:
 
 
 def _ladder(chosen: AblateOptions, vary: Mapping[str, Sequence[Any]], switches: Mapping[str, Any]) -> Ladder:
-    from ihbench.run.ablation import grid, set_on_all
+    from ihbench.runner.ablation import grid, set_on_all
 
     config = profile_of(chosen)
     if vary:
@@ -186,9 +186,9 @@ def _value(chosen: AblateOptions, config: Any, name: str, text: str) -> Any:
 
 def _cells(chosen: AblateOptions, ladder: Ladder, progress: Any) -> list[tuple[str, Cell]]:
     """Rung and cell of every run: seeds outermost, so that an early table holds every rung."""
-    from ihbench.run.ablation import configured, kept, shared_part
-    from ihbench.run.cells import Cell
-    from ihbench.run.run_loop import RunRequest
+    from ihbench.runner.ablation import configured, kept, shared_part
+    from ihbench.runner.cells import Cell
+    from ihbench.runner.run_loop import RunRequest
     from ihbench.scene.data_source import locate
     from ihbench.scene.protocol import load_protocol
 

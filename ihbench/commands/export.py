@@ -40,7 +40,7 @@ def main(argv: list[str]) -> int:
     from ihbench.files.atomic import is_stream
     from ihbench.files.splat_ply import UPRIGHT, VIEWER_TURN, write_splat_ply
     from ihbench.record import outputs
-    from ihbench.run.run_loop import load_avatar
+    from ihbench.runner.run_loop import load_avatar
 
     outputs.check_file(chosen.out, chosen.data, chosen.body)
     avatar, open_capture = load_avatar(chosen.run, chosen.data, chosen.body)

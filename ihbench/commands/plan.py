@@ -34,7 +34,7 @@ def _planned(chosen: SceneChoice, protocol: Protocol) -> dict[str, Any]:
     from ihbench.clock.machine import cpu_model
     from ihbench.record.earlier_runs import earlier_runs
     from ihbench.record.source_digest import code_of
-    from ihbench.run.run_loop import configuration
+    from ihbench.runner.run_loop import configuration
     from ihbench.scene.data_source import locate, open_capture
     from ihbench.scene.plan import absent_regions, measure_scene
 

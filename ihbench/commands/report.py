@@ -120,7 +120,7 @@ def _with_presets(result: RunResult, chosen: ReportOptions) -> RunResult:
     """The run with the numbers of the presets asked for; one whose data are not to be had is named and left out."""
     from ihbench.clock.progress import Progress
     from ihbench.record.results import read_result
-    from ihbench.run.rescore import rescore
+    from ihbench.runner.rescore import rescore
 
     if result.status != "done":
         return result

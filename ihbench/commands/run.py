@@ -96,7 +96,7 @@ def _run(chosen: Any) -> int:
     from dataclasses import replace
 
     from ihbench.clock.progress import Progress
-    from ihbench.run.run_loop import RunRequest, run_scene
+    from ihbench.runner.run_loop import RunRequest, run_scene
     from ihbench.scene.data_source import locate
     from ihbench.scene.protocol import load_protocol
 
@@ -124,8 +124,8 @@ def _repeat(chosen: LikeOptions) -> int:
     check_device(chosen.device)
     registry.entry_point("report", "md")
     from ihbench.clock.progress import Progress
-    from ihbench.run.repeat import differences, repetition
-    from ihbench.run.run_loop import run_scene
+    from ihbench.runner.repeat import differences, repetition
+    from ihbench.runner.run_loop import run_scene
     from ihbench.scene.data_source import locate
 
     progress = Progress()

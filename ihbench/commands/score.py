@@ -79,8 +79,8 @@ def main(argv: list[str]) -> int:
 
 def scored(chosen: ScoreOptions, progress: Progress) -> list[RunResult]:
     """Score what the options name: a result for each scene. Says what is missing or doubtful. Raises `BadInput`."""
-    from ihbench.run.score_predictions import ScoreRequest, score_scene
-    from ihbench.score.calibration import ROWS
+    from ihbench.runner.score_predictions import ScoreRequest, score_scene
+    from ihbench.scoring.calibration import ROWS
 
     source, prepared = _source(chosen)
     name = chosen.name or chosen.predictions.resolve().name
@@ -136,7 +136,7 @@ def _profile_of(chosen: ScoreOptions, sources: Mapping[str, DataSource]) -> str:
     first = next(iter(sources))
     if len(sources) == 1 or not chosen.predictions.is_dir():
         return first
-    from ihbench.score.predictions import size_of_most
+    from ihbench.scoring.predictions import size_of_most
 
     sides: dict[str, tuple[int, int]] = {}  # profile -> px of most of its images, and how many there are of its views
     views: dict[str, int] = {}
@@ -176,7 +176,7 @@ def _with_folders(scenes: tuple[str, ...], root: Path, pattern: str | None) -> t
 
 
 def _print_names(chosen: ScoreOptions, source: DataSource) -> int:
-    from ihbench.score.predictions import expected_names
+    from ihbench.scoring.predictions import expected_names
 
     names = {scene: expected_names(chosen.pattern, scene, source.test_keys(scene)) for scene in source.scenes}
     if chosen.json:

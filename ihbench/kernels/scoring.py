@@ -32,7 +32,7 @@ def score_rows(repeats: int, views: int = VIEWS, profile: str = PROFILE) -> list
     from ihbench.scene.data_source import locate
     from ihbench.scene.protocol import load_protocol
     from ihbench.scene.views import open_scene
-    from ihbench.score.scoring import Scorer
+    from ihbench.scoring.scoring import Scorer
 
     protocol = load_protocol(PROTOCOL, profile)
     source = locate(protocol, None, (protocol.standin_subjects[0],))

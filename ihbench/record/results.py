@@ -16,7 +16,7 @@ from ihbench.record.schema import curve_points, outcome_fault, preset_lines, sco
 from ihbench.record.store import RunFolder
 
 if TYPE_CHECKING:
-    from ihbench.score.scoring import ViewScores
+    from ihbench.scoring.scoring import ViewScores
 
 TRACEBACK = "traceback.txt"  # of a run that failed, in its folder
 Rows = dict[str, dict[str, Mean]]  # row name -> identity -> mean over the scene's test views

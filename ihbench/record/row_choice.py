@@ -11,7 +11,7 @@ from ihbench.metrics import Identity
 from ihbench.record.results import RunResult
 from ihbench.record.row_labels import by_configuration
 from ihbench.registry import nearest
-from ihbench.score.calibration import ROWS
+from ihbench.scoring.calibration import ROWS
 
 
 @dataclass(frozen=True)

@@ -34,9 +34,9 @@ BENCH = Path(__file__).resolve().parents[1]
 NOT_IN_NUMBERS = (
     *(f"{room}/*" for room in registry.ROOMS),
     "commands/*", "kernels/*", "stress/*", "__main__.py", "cli.py", "clock/progress.py", "errors.py", "registry.py",
-    "run/ablation.py", "run/cells.py", "record/earlier_runs.py", "record/index.py", "record/quality_time.py",
-    "score/contact_sheet.py", "document/*", "files/splat_ply.py", "record/row_choice.py", "record/row_labels.py",
-    "api.py", "run/repeat.py", "clock/gpu_slots.py", "clock/failures.py", "clock/streams.py",
+    "runner/ablation.py", "runner/cells.py", "record/earlier_runs.py", "record/index.py", "record/quality_time.py",
+    "scoring/contact_sheet.py", "document/*", "files/splat_ply.py", "record/row_choice.py", "record/row_labels.py",
+    "api.py", "runner/repeat.py", "clock/gpu_slots.py", "clock/failures.py", "clock/streams.py",
     "clock/machine.py", "record/provenance.py", "clock/threads.py",
     "metrics/oracles/*",
 )  # fmt: skip

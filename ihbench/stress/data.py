@@ -30,8 +30,8 @@ from ihbench.scene.plan import measure_scene
 from ihbench.scene.protocol import Protocol, Span
 from ihbench.scene.views import OccludedScene, open_scene
 from ihbench.scene.visibility import texel_visibility
-from ihbench.score.calibration import Calibration
-from ihbench.score.scoring import Scorer
+from ihbench.scoring.calibration import Calibration
+from ihbench.scoring.scoring import Scorer
 from ihbench.stress.case import Answer, Case, Unit, words_of
 from ihbench.stress.drawn_capture import (
     SIZE,

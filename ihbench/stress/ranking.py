@@ -21,7 +21,7 @@ from ihbench.metrics import mean_over_frames
 from ihbench.metrics.eight_bit import as_float
 from ihbench.metrics.evaluate import Preset, evaluate, find_preset
 from ihbench.metrics.identity import metric_of
-from ihbench.score.calibration import Calibration
+from ihbench.scoring.calibration import Calibration
 from ihbench.stress.case import Answer, Case
 from ihbench.stress.drawn_capture import SIZE, small_protocol, the_body, turning_capture
 
@@ -89,7 +89,7 @@ def means(frames: Sequence[Frame], preset: Preset, region: str, metric: str, bac
 def field(background: Color = WHITE) -> tuple[Frame, ...]:
     """Four test views of a person half hidden in training, on a background, and all contestants."""
     from ihbench.scene.views import open_scene
-    from ihbench.score.scoring import Scorer
+    from ihbench.scoring.scoring import Scorer
 
     capture = turning_capture(6)
     protocol = small_protocol(n_frames=6, size=SIZE)

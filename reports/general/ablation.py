@@ -15,8 +15,8 @@ from ihbench.metrics.statistics import Interval, holm, mean_interval, paired_tes
 from ihbench.record.results import RunResult
 from ihbench.reports.general.clock import clock_notes, one_clock
 from ihbench.reports.general.significance import ALPHA, LEVEL, per_scene
-from ihbench.run.ablation import Comparison, Ladder
-from ihbench.run.cells import CellOutcome
+from ihbench.runner.ablation import Comparison, Ladder
+from ihbench.runner.cells import CellOutcome
 
 REGIONS = ("visible", "hidden", "never_seen")  # beside the headline
 PAPER = {"psnr": ("PSNR", 2), "ssim": ("SSIM", 4), "lpips": ("LPIPS*", 2)}

@@ -30,7 +30,7 @@ from ihbench.reports.general.inpainting import inpainting_section
 from ihbench.reports.general.ledger_table import ledger_section
 from ihbench.reports.general.run_time import across_sizes_section, run_time_section
 from ihbench.reports.general.significance import intervals_section
-from ihbench.score.calibration import DESCRIPTIONS, ROWS
+from ihbench.scoring.calibration import DESCRIPTIONS, ROWS
 
 Rows = dict[str, dict[str, Mean]]  # of one run: row -> identity -> mean
 

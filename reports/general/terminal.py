@@ -14,7 +14,7 @@ from ihbench.record.results import TRACEBACK, RunResult
 from ihbench.record.row_labels import by_label
 from ihbench.reports.general.clock import one_clock
 from ihbench.reports.general.significance import scene_means
-from ihbench.score.calibration import ROWS
+from ihbench.scoring.calibration import ROWS
 
 WIDTH = 80
 NARROWEST = 40

@@ -108,7 +108,7 @@ class ReadRow:
 
     @property
     def ranked(self) -> bool:
-        from ihbench.score.calibration import ROWS
+        from ihbench.scoring.calibration import ROWS
 
         first = self.label.partition(" / ")[0]  # what follows tells rows of one name apart
         return first not in ROWS and UNRANKED.match(self.label) is None

@@ -22,7 +22,7 @@ from ihbench.reports.general.significance import LEVEL, scene_means
 from ihbench.reports.paper.marks import marks_by_interval, marks_by_value
 from ihbench.reports.paper.paper_numbers import Column, Component, Group, PaperTable
 from ihbench.scene.protocol import REGIONS
-from ihbench.score.calibration import DESCRIPTIONS, ROWS
+from ihbench.scoring.calibration import DESCRIPTIONS, ROWS
 
 Kind = Literal["quoted", "real data", "stand-in"]
 MEASURED = {"real data": "measured", "stand-in": "stand-in"}  # a block's kind -> the status of its numbers

@@ -12,7 +12,7 @@ import ihbench
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.files.atomic import read_json
-from ihbench.run.run_loop import RunRequest
+from ihbench.runner.run_loop import RunRequest
 from ihbench.scene.data_source import locate
 from ihbench.scene.protocol import load_protocol
 

@@ -21,14 +21,14 @@ from ihbench.files.atomic import read_json
 from ihbench.record.index import Index
 from ihbench.record.results import read_result
 from ihbench.record.store import KILLED, RunFolder
-from ihbench.run.recorded_run import RecordedRun, recorded
+from ihbench.runner.recorded_run import RecordedRun, recorded
 from tests.record.test_store import IDENTITY
 
 # a run that waits for its end, as `ihbench run` makes one
 WAITS = """\
 import sys, time
 from pathlib import Path
-from ihbench import cli; from ihbench.run import recorded_run
+from ihbench import cli; from ihbench.runner import recorded_run
 from tests.record.test_store import IDENTITY
 
 class Waits(recorded_run.RecordedRun):
@@ -49,8 +49,8 @@ sys.exit(cli.main(["run"]))
 WORKERS = """\
 import sys
 from pathlib import Path
-from ihbench.run import cells
-from ihbench.run.cells import Cell, run_cells
+from ihbench.runner import cells
+from ihbench.runner.cells import Cell, run_cells
 from ihbench.clock.progress import Progress
 
 def child(connection, request, source, scene, threads):

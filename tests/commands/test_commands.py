@@ -16,7 +16,7 @@ from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.files.atomic import read_json, read_json_lines
 from ihbench.files.splat_ply import read_splat_ply
 from ihbench.record.results import read_result
-from ihbench.run.run_loop import load_avatar
+from ihbench.runner.run_loop import load_avatar
 from ihbench.scene.data_source import standin_root
 from tests.conftest import contents, tiny_protocol
 

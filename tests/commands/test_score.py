@@ -17,7 +17,7 @@ from ihbench.files import atomic
 from ihbench.files.images import read_image
 from ihbench.scene.data_source import standin_root
 from ihbench.scene.views import TestViewKey, open_scene
-from ihbench.score.predictions import find_alpha, find_predictions
+from ihbench.scoring.predictions import find_alpha, find_predictions
 
 KEYS = [TestViewKey(c, f, f"cam{c}") for c in (1, 2) for f in (0, 30)]
 WHITE = (1.0, 1.0, 1.0)

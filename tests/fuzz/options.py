@@ -268,7 +268,11 @@ def cut_short() -> Iterator[None]:
     import_all()  # a module imported inside would keep what stands here for good
 
     places = (
-        *("ihbench.run.run_loop.run_scene", "ihbench.run.cells.run_scene", "ihbench.metrics.oracles.check.check"),
+        *(
+            "ihbench.runner.run_loop.run_scene",
+            "ihbench.runner.cells.run_scene",
+            "ihbench.metrics.oracles.check.check",
+        ),
         *("ihbench.stress.run.run_cases", "ihbench.kernels.table.run_kernels", "ihbench.metrics.weights.fetch"),
         "ihbench.methods.inpainthuman.studies.paint_table.paint_scene",
         "ihbench.diffusion.crops.crop_album.CropAlbum.make",

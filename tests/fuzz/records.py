@@ -23,9 +23,9 @@ from ihbench.record.reopen import reopen_body, reopen_capture, reopen_protocol
 from ihbench.record.results import read_result
 from ihbench.record.store import RunFolder
 from ihbench.reports.general import ablation
-from ihbench.run.ablation import Comparison, Ladder, Rung
-from ihbench.run.cells import Cell, CellOutcome
-from ihbench.run.shared_states import lend, lender
+from ihbench.runner.ablation import Comparison, Ladder, Rung
+from ihbench.runner.cells import Cell, CellOutcome
+from ihbench.runner.shared_states import lend, lender
 from tests.reports.fake_runs import LPIPS, PSNR, SSIM, about, identity
 
 MISSING = object()
@@ -276,7 +276,7 @@ def _attacked(runs: Path, good: Path, victim: Path, figures: Path | None) -> Ite
 
 
 def _ablation(runs: Path, good: Path, victim: Path) -> None:
-    from ihbench.run.run_loop import RunRequest
+    from ihbench.runner.run_loop import RunRequest
     from tests.bench.fake_capture import fake_protocol
 
     ladder = Ladder("t", (Rung("a"), Rung("b")), (Comparison("b", "a", "b"),))

@@ -21,7 +21,7 @@ from ihbench.methods.inpainthuman.config import QUICK, InpaintHumanConfig, confi
 from ihbench.methods.inpainthuman.method import InpaintHuman
 from ihbench.methods.inpainthuman.stages.stage1 import Stage1, draw, loss_of, prepare_target
 from ihbench.metrics.ssim import ssim_map
-from ihbench.run.run_loop import RunRequest, _outside
+from ihbench.runner.run_loop import RunRequest, _outside
 from ihbench.scene.protocol import load_protocol
 from tests.bench.fake_capture import a_camera, a_pose, the_body, train_view
 from tests.diffusion.sd2_miniature import make_miniature

@@ -19,16 +19,16 @@ from ihbench.files import atomic
 from ihbench.record import source_digest
 from ihbench.record.source_digest import bench_code, code_of, tree_digest
 from ihbench.record.store import RunFolder, identity_digest
-from ihbench.run.shared_states import lender
+from ihbench.runner.shared_states import lender
 from ihbench.scene.protocol import load_protocol
-from ihbench.score.calibration import Calibration
+from ihbench.scoring.calibration import Calibration
 from tests.bench.test_house import imports
 
 ROOT = Path(__file__).resolve().parents[2]
 ROOMS = ("ihbench", *registry.ROOMS)
 # of what is left out, the modules that code with numbers may use: they say, find, measure or show
 HARMLESS = {
-    *("api", "errors", "registry", "record.provenance", "score.contact_sheet"),
+    *("api", "errors", "registry", "record.provenance", "scoring.contact_sheet"),
     *(f"clock.{name}" for name in ("failures", "streams", "progress", "machine", "threads")),
 }
 
@@ -43,16 +43,16 @@ OF_THE_BENCH = [
     ),
     *("ihbench/metrics/ssim.py", "ihbench/metrics/flip_numba.py", "ihbench/metrics/presets.py"),
     *(
-        "ihbench/score/scoring.py",
-        "ihbench/run/score_stage.py",
-        "ihbench/score/calibration.py",
-        "ihbench/score/predictions.py",
+        "ihbench/scoring/scoring.py",
+        "ihbench/runner/score_stage.py",
+        "ihbench/scoring/calibration.py",
+        "ihbench/scoring/predictions.py",
     ),
     *(
         "ihbench/scene/plan.py",
         "ihbench/scene/protocol.py",
         "ihbench/camera.py",
-        "ihbench/run/run_loop.py",
+        "ihbench/runner/run_loop.py",
         "ihbench/clock/ledger.py",
     ),
     *("protocols/occlusion.py", "datasets/zju_mocap/original.py", "datasets/reading/capture_folder.py"),

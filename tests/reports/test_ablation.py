@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from ihbench.reports.general.ablation import write
-from ihbench.run.ablation import Comparison, Ladder, Rung
+from ihbench.runner.ablation import Comparison, Ladder, Rung
 from tests.reports.made_up_runs import made_up
 
 SCENES = tuple("abcdef")

@@ -17,7 +17,7 @@ from ihbench.scene.contracts import MaskState
 from ihbench.scene.occlusion import Occlusion, occluder
 from ihbench.scene.protocol import load_protocol, protocol_from, read_protocol
 from ihbench.scene.views import open_scene, uncovered
-from ihbench.score.scoring import Scorer
+from ihbench.scoring.scoring import Scorer
 
 from .fake_capture import DISTORTION, fake_protocol, rasterized, the_body, turning_capture
 

@@ -29,7 +29,7 @@ from ihbench.record.reopen import reopen_scene
 from ihbench.record.results import read_result
 from ihbench.scene.contracts import MaskState, TrainingSet, TrainView
 from ihbench.scene.views import OccludedScene, uncovered
-from ihbench.score.scoring import Scorer
+from ihbench.scoring.scoring import Scorer
 
 STATES = (Stage1.name, PAINTED_STATE)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ihbench.run.ablation import Comparison, Ladder, Rung
+from ihbench.runner.ablation import Comparison, Ladder, Rung
 
 ONE_LEVEL: dict[str, Any] = {"levels": (128,)}  # the paper does not say which single map its baseline has
 NO_PAINTER: dict[str, Any] = {"inpaint.on": False}

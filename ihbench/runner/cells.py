@@ -18,7 +18,7 @@ from ihbench.clock.interruption import GRACE, end_with_parent, interruptible, re
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.record.results import RunResult, read_result
-from ihbench.run.run_loop import RunRequest, run_scene
+from ihbench.runner.run_loop import RunRequest, run_scene
 from ihbench.scene.data_source import DataSource
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")

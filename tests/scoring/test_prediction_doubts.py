@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ihbench.score.prediction_doubts import Doubts
+from ihbench.scoring.prediction_doubts import Doubts
 
 WHITE = (1.0, 1.0, 1.0)
 N, H, W = 8, 72, 64

@@ -12,7 +12,7 @@ from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.record.store import RunFolder
-from ihbench.run.recorded_run import RecordedRun, recorded
+from ihbench.runner.recorded_run import RecordedRun, recorded
 from tests.record.test_store import IDENTITY
 
 

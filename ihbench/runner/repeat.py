@@ -12,8 +12,8 @@ from ihbench.errors import BadInput
 from ihbench.record.reopen import reopen_protocol
 from ihbench.record.results import RunResult, read_result
 from ihbench.record.store import RunFolder
-from ihbench.run.run_loop import RunRequest, configuration
-from ihbench.run.score_predictions import MADE_ELSEWHERE
+from ihbench.runner.run_loop import RunRequest, configuration
+from ihbench.runner.score_predictions import MADE_ELSEWHERE
 
 NOT_SWITCHES = ("keep", "outside")  # of a recorded configuration
 

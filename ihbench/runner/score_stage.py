@@ -21,9 +21,9 @@ from ihbench.record.schema import score_lines
 from ihbench.record.source_digest import bench_code
 from ihbench.record.store import RunFolder
 from ihbench.scene.views import OccludedScene
-from ihbench.score.calibration import ROWS, Calibration
-from ihbench.score.contact_sheet import SheetRow, contact_sheet
-from ihbench.score.scoring import LoadedView, Predictor, Scorer
+from ihbench.scoring.calibration import ROWS, Calibration
+from ihbench.scoring.contact_sheet import SheetRow, contact_sheet
+from ihbench.scoring.scoring import LoadedView, Predictor, Scorer
 
 if TYPE_CHECKING:
     from ihbench.body import Body

@@ -30,16 +30,16 @@ from ihbench.record.reopen import reopen_body, reopen_capture
 from ihbench.record.results import RunResult
 from ihbench.record.source_digest import code_of, shipped_digest
 from ihbench.record.store import RunFolder, RunIdentity, is_finished
-from ihbench.run.recorded_run import RecordedRun, about_scene, recorded
-from ihbench.run.score_stage import ScoreStage
+from ihbench.runner.recorded_run import RecordedRun, about_scene, recorded
+from ihbench.runner.score_stage import ScoreStage
 from ihbench.scene.capture_digest import capture_digest
 from ihbench.scene.contracts import Avatar, Capture, Method, TestView, TrainingSet
 from ihbench.scene.data_source import DataSource
 from ihbench.scene.plan import Omission, SceneMeasure, absent_regions, measure_scene
 from ihbench.scene.protocol import Protocol
 from ihbench.scene.views import OccludedScene, open_scene
-from ihbench.score.curve_views import curve_views
-from ihbench.score.scoring import Scorer
+from ihbench.scoring.curve_views import curve_views
+from ihbench.scoring.scoring import Scorer
 
 if TYPE_CHECKING:
     from ihbench.body import Body
@@ -209,7 +209,7 @@ class _Run(RecordedRun):
     def _take_shared_states(self) -> None:
         """Copy saved states of finished runs that differ only in fields on which these states do not depend. Their
         seconds count as this run's own: the clock is saved with a state."""
-        from ihbench.run.shared_states import lend, lender
+        from ihbench.runner.shared_states import lend, lender
 
         states = getattr(registry.load("config", self.request.method), "SHARED_STATES", {})
         for state, free in states.items():

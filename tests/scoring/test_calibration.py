@@ -8,7 +8,7 @@ import pytest
 from ihbench.body import texel_table
 from ihbench.metrics import psnr
 from ihbench.scene.contracts import MaskState
-from ihbench.score.calibration import DESCRIPTIONS, ROWS, Calibration
+from ihbench.scoring.calibration import DESCRIPTIONS, ROWS, Calibration
 
 from .fake_capture import SIZE, WHITE, a_camera, a_pose, rasterized, the_body, train_view, truth_view
 

@@ -12,15 +12,15 @@ from ihbench.record.provenance import command
 from ihbench.record.results import RunResult, read_result
 from ihbench.record.source_digest import bench_code
 from ihbench.record.store import RunFolder, RunIdentity
-from ihbench.run.recorded_run import RecordedRun, about_scene, recorded
-from ihbench.run.score_stage import ScoreStage
+from ihbench.runner.recorded_run import RecordedRun, about_scene, recorded
+from ihbench.runner.score_stage import ScoreStage
 from ihbench.scene.capture_digest import capture_digest
 from ihbench.scene.data_source import DataSource
 from ihbench.scene.protocol import Protocol
 from ihbench.scene.views import OccludedScene, open_scene
-from ihbench.score.prediction_doubts import Doubts
-from ihbench.score.predictions import Predictions, find_alpha, find_predictions
-from ihbench.score.scoring import Scorer
+from ihbench.scoring.prediction_doubts import Doubts
+from ihbench.scoring.predictions import Predictions, find_alpha, find_predictions
+from ihbench.scoring.scoring import Scorer
 from ihbench.version import __version__
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ class ScoreRequest:
     runs: Path = Path("runs")
     body: Path | None = None  # SMPL model file, for real data
     force: bool = False
-    alpha: str | None = None  # what the colours of transparent pixels are, see `ihbench.score.predictions`
+    alpha: str | None = None  # what the colours of transparent pixels are, see `ihbench.scoring.predictions`
     prepared: Prepared | None = None  # what was handed out to the code that drew the images
 
 

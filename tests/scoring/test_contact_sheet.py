@@ -10,7 +10,7 @@ from PIL import Image
 
 from ihbench.errors import BadInput
 from ihbench.files.images import write_png
-from ihbench.score.contact_sheet import COLUMNS, GREY, SheetRow, contact_sheet, error_image
+from ihbench.scoring.contact_sheet import COLUMNS, GREY, SheetRow, contact_sheet, error_image
 
 H, W = 40, 160  # wider than the column heads, so that cells lie at known places
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.metrics.images import Color, bounds, grown
-from ihbench.score.scoring import LoadedView
+from ihbench.scoring.scoring import LoadedView
 
 FAR_BETTER = 0.5  # of the squared error, at most
 CURVED = 0.1  # of it, at most, where a curve of brightness is exchanged: dark and pale avatars have such, too

@@ -20,7 +20,7 @@ from ihbench.scene.views import straight_camera
 
 if TYPE_CHECKING:
     from ihbench.scene.views import TestViewKey
-    from ihbench.score.scoring import Scorer
+    from ihbench.scoring.scoring import Scorer
 
 SIDE = 64  # px, longer side at which bodies are drawn to count what they show
 SHARES_COUNT = 3.0  # weight of the regions' shares beside the camera's direction and the frame: they move scores most

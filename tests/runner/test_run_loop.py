@@ -19,7 +19,7 @@ from ihbench.scene.contracts import MaskState
 from ihbench.scene.data_source import locate
 from ihbench.scene.protocol import load_protocol
 from ihbench.scene.views import open_scene
-from ihbench.score.calibration import ROWS, Calibration
+from ihbench.scoring.calibration import ROWS, Calibration
 from tests.conftest import contents
 
 SWITCHES = {

@@ -33,7 +33,7 @@ def run_until_killed(bench, patch):
     """The run in a process of its own, which a patch of the bench kills with SIGKILL."""
     code = f"""\
 import os, signal, sys
-from ihbench.run import run_loop
+from ihbench.runner import run_loop
 from ihbench.cli import main
 from ihbench.clock.ledger import Ledger
 
@@ -94,7 +94,7 @@ def test_a_run_killed_while_scoring_ends_with_the_same_numbers(bench, finished):
     run_until_killed(
         bench,
         """
-        from ihbench.run import score_stage
+        from ihbench.runner import score_stage
         write, left = score_stage.write_png, [1, 1]
         score_stage.write_png = lambda *a: write(*a) if left and left.pop() else die()
         """,

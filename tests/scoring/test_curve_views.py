@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from ihbench.metrics import mean_over_frames
 from ihbench.scene.protocol import Span, TestGroup
 from ihbench.scene.views import open_scene
-from ihbench.score.calibration import Calibration
-from ihbench.score.curve_views import curve_views, representatives
-from ihbench.score.scoring import Scorer
+from ihbench.scoring.calibration import Calibration
+from ihbench.scoring.curve_views import curve_views, representatives
+from ihbench.scoring.scoring import Scorer
 
 from .fake_capture import a_camera, fake_protocol, the_body, turning_capture
 
@@ -88,7 +88,7 @@ def test_of_few_views_all_are_taken_and_groups_stand_apart():
 
 
 def test_of_a_long_video_a_few_frames_are_looked_at(monkeypatch):
-    monkeypatch.setattr("ihbench.score.curve_views.MOST_FRAMES", 8)
+    monkeypatch.setattr("ihbench.scoring.curve_views.MOST_FRAMES", 8)
     scorer = Scorer.build(open_scene(turning_capture(40), fake_protocol("zju_occ", 40)), the_body())
     chosen = curve_views(scorer, 6)
     frames = [scorer.scene.test_keys[k].frame for k in chosen]

@@ -21,8 +21,8 @@ from ihbench.record.results import view_rows
 from ihbench.record.schema import preset_lines
 from ihbench.record.source_digest import bench_code
 from ihbench.record.store import RunFolder
-from ihbench.run.score_stage import ScoreStage, render_path
-from ihbench.score.scoring import LoadedView, Scorer, ViewScores
+from ihbench.runner.score_stage import ScoreStage, render_path
+from ihbench.scoring.scoring import LoadedView, Scorer, ViewScores
 
 
 def rescore(folder: Path, preset: str, data: Path | None, body: Path | None, progress: Progress) -> None:

@@ -12,8 +12,8 @@ from ihbench.errors import BadInput
 from ihbench.scene.protocol import REGIONS
 from ihbench.scene.views import open_scene
 from ihbench.scene.visibility import texel_visibility
-from ihbench.score import scoring
-from ihbench.score.scoring import Scorer
+from ihbench.scoring import scoring
+from ihbench.scoring.scoring import Scorer
 
 from .fake_capture import fake_protocol, the_body, turning_capture
 
