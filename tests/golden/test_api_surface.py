@@ -8,6 +8,9 @@ from importlib import import_module
 from importlib.metadata import distribution
 from typing import Any
 
+import pytest
+
+import ihbench
 from tests.golden.expected import check
 
 MODULES = {"ihbench": None, "ihbench.metrics": None, "ihbench.body": None}  # what their __all__ names
@@ -24,6 +27,8 @@ def described(value: Any) -> Any:
 
 
 def test_the_python_surface_is_as_it_was():
+    with pytest.raises(Exception, match="nope"):  # what a call imports must not take a function's place
+        ihbench.run("nope")
     surface = {
         name: {public: described(getattr(import_module(name), public)) for public in sorted(only or _all(name))}
         for name, only in MODULES.items()
