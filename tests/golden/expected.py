@@ -60,7 +60,8 @@ def stop_clock(folder: Path) -> str:
     record["machine"] |= {"load_average": [0.5, 0.5, 0.5], "load_average_end": [0.5, 0.5, 0.5]}
     (folder / "run.json").write_text(json.dumps(record), encoding="utf-8")
     points = [json.loads(line) for line in (folder / "curve.jsonl").read_text(encoding="utf-8").splitlines()]
-    lines = [json.dumps(point | {"seconds": point["step"] / 8}) + "\n" for point in points]
+    # a slow machine offers more checkpoints than the last
+    lines = [json.dumps(point | {"seconds": point["step"] / 8}) + "\n" for point in points[-1:]]
     (folder / "curve.jsonl").write_text("".join(lines), encoding="utf-8")
     return record["machine"]["cpu"]
 
