@@ -74,6 +74,7 @@ class LookedAt:
     base_unet: UnreadModule | None  # to make a ControlNet from
     tokenizer: Any
     scheduler: Any
+    vae_upcast: bool  # whether the VAE stays in fp32, whatever the rest is in
 
 
 def look_at_sd2(weights: str, control: str | None = None) -> LookedAt:
@@ -86,7 +87,8 @@ def look_at_sd2(weights: str, control: str | None = None) -> LookedAt:
     scheduler, tokenizer = _scheduler(folder), _tokenizer(folder, configs["text_encoder"])
     unet, vae, text_encoder = _unread(folder, configs)
     controlnet, base_unet = _unread_control(control, unet.module.config, vae.module.config)
-    return LookedAt(folder, unet, vae, text_encoder, controlnet, base_unet, tokenizer, scheduler)
+    upcast = bool(vae.module.config["force_upcast"])
+    return LookedAt(folder, unet, vae, text_encoder, controlnet, base_unet, tokenizer, scheduler, upcast)
 
 
 def load_sd2(
@@ -110,7 +112,7 @@ def load_sd2(
     device = torch.device(device)
     number = _number_type(dtype, device)
     found = look_at_sd2(weights, control)
-    vae_number = torch.float32 if found.vae.module.config["force_upcast"] else number
+    vae_number = torch.float32 if found.vae_upcast else number
     too_small = f"{OPTION} {found.folder}: {device} has too little free memory for these weights"
     with said_when_full(f"{too_small}; free some, or use another GPU"):
         # part by part, so that no more than one is in memory twice

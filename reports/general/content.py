@@ -12,6 +12,7 @@ from ihbench.document.document import (
     Heading,
     Paragraph,
     Picture,
+    Span,
     Table,
     Words,
     bullets,
@@ -133,7 +134,7 @@ def _group(runs: list[RunResult], presets: Sequence[str], targets: Sequence[Targ
     return blocks + inpainting_section(labelled)
 
 
-def _data(run: RunResult) -> tuple[Words, ...]:
+def _data(run: RunResult) -> tuple[str | Span, ...]:
     about = run.record["about"]
     if about["standin"]:
         return strong(about["standin"]), ": made by the bench, not real data"
