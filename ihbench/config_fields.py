@@ -1,40 +1,200 @@
-"""A method's configuration as flat names: a dataclass in a dataclass has dotted fields, as on the command line."""
+"""A configuration as flat names, as on the command line, and as a table, as in TOML and JSON: a dataclass in a
+dataclass has dotted fields in the one and is a table of its own in the other."""
 
 from __future__ import annotations
 
+import types
+import unicodedata
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass, replace
-from typing import Any
+from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
+from functools import cache
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from ihbench.bounds import check
+from ihbench.bounds import check, expected, fits, rules, shown
+from ihbench.errors import BadInput
+from ihbench.registry import nearest
+
+LONGEST_NAME, LONGEST_TEXT = 80, 2000  # characters
+MOST_ENTRIES = 10_000  # of a list
+
+Kind = TypeVar("Kind")
+
+
+@dataclass(frozen=True)
+class Entries:
+    """Lists of `least` entries or more."""
+
+    least: int = 0
+
+
+@dataclass(frozen=True)
+class FolderName:
+    """Texts that may become the name of a folder, such as a subject or a protocol's id."""
+
+    def holds(self, text: str) -> bool:
+        unfit = any(sign in "/\\" or unicodedata.category(sign)[0] == "C" for sign in text)
+        return bool(text.strip()) and len(text) <= LONGEST_NAME and not (unfit or text.startswith("."))
+
+    def __str__(self) -> str:
+        return f"a name of 1 to {LONGEST_NAME} characters, no slash, no dot in front, no control character"
+
+
+@dataclass(frozen=True)
+class Readable:
+    """Texts for readers."""
+
+    def holds(self, text: str) -> bool:
+        return len(text) <= LONGEST_TEXT
+
+    def __str__(self) -> str:
+        return f"a text of up to {LONGEST_TEXT} characters"
+
+
+Name = Annotated[str, FolderName()]
+Text = Annotated[str, Readable()]
 
 
 def flat(config: Any) -> dict[str, Any]:
-    """Name -> value; the fields of a nested dataclass come as "outer.inner"."""
+    """Name -> value of a dataclass or a table; the fields of a nested one come as "outer.inner"."""
     out: dict[str, Any] = {}
-    for field in fields(config):
-        value = getattr(config, field.name)
-        if is_dataclass(value) and not isinstance(value, type):
-            out |= {f"{field.name}.{name}": inner for name, inner in flat(value).items()}
+    for name, value in (config if isinstance(config, Mapping) else _members(config)).items():
+        if isinstance(value, Mapping) or is_config(value):
+            out |= {f"{name}.{inner}": leaf for inner, leaf in flat(value).items()}
         else:
-            out[field.name] = value
+            out[name] = value
     return out
 
 
 def with_fields(config: Any, values: Mapping[str, Any]) -> Any:
     """The configuration with some fields, named as `flat` names them, replaced. Raises `TypeError` for others, and
     `BadInput` for values of another type or out of bounds."""
-    changed = _replaced(config, values)
+    changed = replaced(config, values)
     check(changed, "--method.")
     return changed
 
 
-def _replaced(config: Any, values: Mapping[str, Any]) -> Any:
+def replaced(config: Kind, values: Mapping[str, Any]) -> Kind:
+    """As `with_fields`, values unchecked."""
     own: dict[str, Any] = {name: value for name, value in values.items() if "." not in name}
     for outer in dict.fromkeys(name.partition(".")[0] for name in values if "." in name):
         inner = {name.partition(".")[2]: value for name, value in values.items() if name.startswith(outer + ".")}
         nested = getattr(config, outer, None)
-        if not is_dataclass(nested) or isinstance(nested, type):
+        if not is_config(nested):
             raise TypeError(f"no field {outer!r} with fields of its own")
-        own[outer] = _replaced(nested, inner)
-    return replace(config, **own)
+        own[outer] = replaced(nested, inner)
+    return replace(config, **own)  # type: ignore[type-var]
+
+
+def is_config(value: Any) -> bool:
+    """Whether a value is a dataclass's (and not a dataclass)."""
+    return is_dataclass(value) and not isinstance(value, type)
+
+
+def hints(kind: type) -> dict[str, Any]:
+    """Name -> type of every field of a dataclass, nested ones as in `flat`; one that is written as a text (it has
+    `from_text`) is a value."""
+    out: dict[str, Any] = {}
+    own = _hints(kind)
+    for field in fields(kind):
+        hint = own[field.name]
+        if isinstance(hint, type) and is_dataclass(hint) and not has_text(hint):
+            out |= {f"{field.name}.{inner}": its for inner, its in hints(hint).items()}
+        else:
+            out[field.name] = hint
+    return out
+
+
+def has_text(hint: Any) -> bool:
+    """Whether a type's values can be written as a text, which its `from_text` reads (raising `ValueError`)."""
+    return getattr(hint, "HAS_TEXT", False)
+
+
+def as_table(value: Any, kind: type | None = None) -> Any:
+    """A value as TOML and JSON have it: dataclasses (as if of `kind`, a parent) and mappings as tables, tuples as
+    lists; a field that has its default is left out."""
+    if is_config(value):
+        own = [(field.name, getattr(value, field.name), field.default) for field in fields(kind or value)]
+        return {name: as_table(item) for name, item, default in own if default is MISSING or item != default}
+    if isinstance(value, Mapping):
+        return {name: as_table(item) for name, item in value.items()}
+    return [as_table(item) for item in value] if isinstance(value, tuple | list) else value
+
+
+def read(hint: Any, value: Any, where: str, key: str = "", strict: bool = True) -> Any:
+    """A value of a type from what TOML or JSON has of it; a dataclass from a table, or a text if it has one.
+
+    Raises `BadInput` for the first part that is not of its type or out of bounds, named by its key: "where:
+    image.size: expected …". `strict` refuses keys that a dataclass does not have; off for files that another version
+    may have written.
+    """
+    if get_origin(hint) in (Union, types.UnionType):
+        some = [part for part in get_args(hint) if part is not type(None)]
+        hint = some[0] if len(some) == 1 else hint
+    plain, extras = (get_args(hint)[0], hint.__metadata__) if get_origin(hint) is Annotated else (hint, ())
+    origin, parts, at = get_origin(plain), get_args(plain), f"{where}: {key}" if key else where
+    if has_text(plain) and isinstance(value, str):
+        try:
+            return plain.from_text(value)
+        except ValueError as error:
+            raise BadInput(f"{at}{':' * bool(key)} {shown(value)}: {error}") from error
+    if isinstance(plain, type) and is_dataclass(plain):
+        return _read_fields(plain, value, where, key, strict)
+    if origin is Mapping:
+        named = f"{key}, the name of an entry"
+        return {
+            read(parts[0], name, where, named): read(parts[1], item, where, f"{key}.{name}", strict)
+            for name, item in _table(value, where, key).items()
+        }
+    if origin is tuple:
+        free = parts[-1] is Ellipsis
+        least = max([word.least for word in extras if isinstance(word, Entries)], default=0) if free else len(parts)
+        most = MOST_ENTRIES if free else least
+        if not isinstance(value, list | tuple) or not least <= len(value) <= most:
+            count = f"{least} to {most}" if free else least
+            raise BadInput(f"{at}: expected a list of {count} entries, found {_shown(value)}")
+        kinds = parts[:1] * len(value) if free else parts
+        entries = enumerate(zip(kinds, value, strict=True), 1)
+        return tuple(read(kind, item, where, f"{key}, entry {k}", strict) for k, (kind, item) in entries)
+    words: list[Any] = [word for word in extras if isinstance(word, FolderName | Readable)]
+    bounds: list[Any] = [] if isinstance(value, bool | str) else [*rules(hint)]
+    if not (fits(value, hint) and all(rule.holds(value) for rule in bounds + words)):
+        raise BadInput(f"{at}: expected {words[0] if words else expected(hint)}, found {_shown(value)}")
+    return value
+
+
+def _read_fields(kind: type[Kind], value: Any, where: str, key: str, strict: bool) -> Kind:
+    table, inside = _table(value, where, key), f"{key}." if key else ""
+    known = {field.name: field for field in fields(kind)}  # type: ignore[arg-type]
+    for name in table:
+        if strict and name not in known:
+            raise BadInput(f"{where}: unknown key {inside + name!r}: {nearest(name, list(known))}")
+    for name, field in known.items():
+        if name not in table and field.default is MISSING:
+            raise BadInput(f"{where}: key {inside + name!r} is missing")
+    own = _hints(kind)
+    given = {name: read(own[name], table[name], where, inside + name, strict) for name in known if name in table}
+    try:
+        return kind(**given)
+    except ValueError as error:
+        raise BadInput(f"{where}: {key + ': ' if key else ''}{error}") from error
+
+
+@cache
+def _hints(kind: type) -> dict[str, Any]:
+    return get_type_hints(kind, include_extras=True)
+
+
+def _table(value: Any, where: str, key: str) -> Mapping[str, Any]:
+    if not isinstance(value, Mapping):
+        raise BadInput(f"{where}: {key or 'the file'}: expected a table, found {_shown(value)}")
+    return value
+
+
+def _members(config: Any) -> dict[str, Any]:
+    return {field.name: getattr(config, field.name) for field in fields(config)}
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "a table"
+    return f"a list of {len(value)}" if isinstance(value, list | tuple) and len(value) > 3 else shown(value)

@@ -38,12 +38,13 @@ def fixed_strip(request: OcclusionRequest) -> Occlusion:
     tiangexiang/OccNeRF configs) and scale with the image width. Raises `BadInput` for a subject without a strip.
     """
     rule = request.rule
-    if request.subject not in rule.strips:
+    strips = rule.strips or {}
+    if request.subject not in strips:
         raise BadInput(
             f"occlusion 'fixed-strip': no strip is published for subject {request.subject!r}; "
             f"use --occlusion.rule strip-generic"
         )
-    mid, width = rule.strips[request.subject]
+    mid, width = strips[request.subject]
     scale = request.width / rule.reference_width
     return _strip("fixed-strip", round(mid * scale), round(width * scale), request)
 
@@ -200,7 +201,7 @@ def _per_frame(rule: str, request: OcclusionRequest, hidden: Callable[[int, Mask
 
     record: dict[str, Any] = {"fraction": request.rule.fraction}
     if rule in ("blocks", "object"):
-        record["seed"] = request.rule.seed
+        record["seed"] = request.rule.seed or 0
     return Occlusion(rule, of, record)
 
 
@@ -212,4 +213,4 @@ def _first_share(counts: NDArray[np.integer], fraction: float) -> int:
 
 def _rng(request: OcclusionRequest, frame: int | None) -> np.random.Generator:
     name = int.from_bytes(hashlib.sha256(request.subject.encode()).digest()[:4])
-    return np.random.default_rng([request.rule.seed, name, *([] if frame is None else [frame])])
+    return np.random.default_rng([request.rule.seed or 0, name, *([] if frame is None else [frame])])

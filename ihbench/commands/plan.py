@@ -70,7 +70,7 @@ def _planned(chosen: SceneChoice, protocol: Protocol) -> dict[str, Any]:
             report["scenes"][scene] = {"note": f"the run makes the rest of this stand-in; measured then: {error}"}
             continue
         stages = {} if earlier is None else earlier.stages
-        omissions = leave_out(config, measure) + absent_regions(measure, protocol.regions)
+        omissions = leave_out(config, measure) + absent_regions(measure, protocol.metrics.regions)
         report["scenes"][scene] = {
             "measure": asdict(measure),
             "left_out": [asdict(o) | {"seconds": o.seconds(stages)} for o in omissions],

@@ -11,7 +11,7 @@ import tyro
 from ihbench.commands.options.parse import options
 from ihbench.commands.options.scene_choice import ProtocolChanges
 from ihbench.scene.occlusion import withheld
-from ihbench.scene.protocol import Protocol, difference, flatten, load_protocol
+from ihbench.scene.protocol import Protocol, difference, load_protocol, spelled
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,14 +56,14 @@ def _show(chosen: Show) -> int:
         print(json.dumps(shown[0] if len(shown) == 1 else {"protocols": shown}))
         return 0
     for k, content in enumerate(shown):
-        pairs = list(flatten(content))
-        width = max(len(key) for key, _ in pairs)
-        print("\n" * bool(k) + "\n".join(f"{key:<{width}}  {value}" for key, value in pairs))
+        values = spelled(content)
+        width = max(map(len, values))
+        print("\n" * bool(k) + "\n".join(f"{key:<{width}}  {value}" for key, value in values.items()))
     return 0
 
 
 def _shown(protocol: Protocol) -> dict[str, Any]:
-    absent = withheld(protocol.regions) if protocol.occlusion.in_scene else {}
+    absent = withheld(protocol.metrics.regions) if protocol.occlusion.in_scene else {}
     ends = {"profile": protocol.profile, "digest": protocol.digest}
     return {**protocol.content, **({"absent": absent} if absent else {}), **ends}
 

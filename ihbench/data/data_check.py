@@ -36,7 +36,7 @@ def fitness(capture: Capture, protocol: Protocol) -> str:
     n_frames, n_cameras = capture.n_frames, len(capture.camera_ids)
     training = protocol.training_frames(capture.name, n_frames)
     tested = protocol.test_views(capture.name, n_frames, n_cameras)
-    views = {(protocol.train_camera, frame) for frame in training} | {(c, f) for c, f, _ in tested}
+    views = {(protocol.train.camera, frame) for frame in training} | {(c, f) for c, f, _ in tested}
     last = max((frame for _, frame in views), default=-1)
     if not training:
         return f"no training frame among its {n_frames}"
@@ -44,7 +44,7 @@ def fitness(capture: Capture, protocol: Protocol) -> str:
         return f"no test view: it has {n_cameras} camera{'s' * (n_cameras != 1)}"
     if last >= n_frames:
         return f"has {n_frames} frames, needs frame {last}"
-    missing = sum(capture.lacks(camera, frame, protocol.silhouette) for camera, frame in views)
+    missing = sum(capture.lacks(camera, frame, protocol.subjects.silhouette) for camera, frame in views)
     return f"{missing} of {len(views)} views missing" if missing else "complete"
 
 
@@ -114,7 +114,7 @@ def add_fitness(found: dict[str, Any], root: Path, body: Body | None, named: Pat
                 continue
             if capture.body == "smpl":
                 capture = source.open(subject["subject"], body=body)
-            picture = overlay(capture, capture.model, protocols[0].silhouette if protocols else "mask")
+            picture = overlay(capture, capture.model, protocols[0].subjects.silhouette if protocols else "mask")
         except BadInput as error:
             if not subject["problems"]:
                 subject["problems"].append(str(error))

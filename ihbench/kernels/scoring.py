@@ -35,7 +35,7 @@ def score_rows(repeats: int, views: int = VIEWS, profile: str = PROFILE) -> list
     from ihbench.scoring.scoring import Scorer
 
     protocol = load_protocol(PROTOCOL, profile)
-    source = locate(protocol, None, (protocol.standin_subjects[0],))
+    source = locate(protocol, None, (protocol.subjects.standin[0],))
     capture, body = source.open(source.scenes[0], None, Progress())
     scene = open_scene(capture, protocol)
     background = protocol.image.background

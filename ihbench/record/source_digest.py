@@ -60,7 +60,7 @@ def bench_code(protocol: Protocol, presets: Sequence[str] | None = None) -> str:
     protocol's. Raises `BadInput` when a file that was hashed before in this process has other code now."""
     rules = dict.fromkeys((protocol.occlusion.rule, protocol.occlusion.unlisted))
     parts = [("dataset", protocol.dataset), *(("occlusion", rule) for rule in rules)]
-    parts += [("metric preset", name) for name in (protocol.presets if presets is None else presets)]
+    parts += [("metric preset", name) for name in (protocol.metrics.presets if presets is None else presets)]
     return hashlib.sha256(f"{tree_digest(BENCH, NOT_IN_NUMBERS)} {_digest_of(parts)}".encode()).hexdigest()[:LENGTH]
 
 

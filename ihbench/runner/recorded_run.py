@@ -147,6 +147,6 @@ def about_scene(capture: Capture, protocol: Protocol) -> dict[str, Any]:
         "standin": capture.standin,
         "variant": capture.variant,
         "body": capture.body,
-        "headline": protocol.headline,
+        "headline": protocol.metrics.headline,
         "protocol": protocol.content,
     }

@@ -246,7 +246,7 @@ def _planned(request: RunRequest, measure: SceneMeasure) -> tuple[Any, list[Omis
     withheld = [o.field for o in proposed if "all" in request.keep or o.field in request.keep]
     taken = [o for o in proposed if o.field not in withheld]
     config = with_fields(request.config, {o.field: o.value for o in taken})
-    return config, taken + absent_regions(measure, request.protocol.regions), withheld
+    return config, taken + absent_regions(measure, request.protocol.metrics.regions), withheld
 
 
 def _changed(request: RunRequest, withheld: list[str]) -> list[str]:

@@ -116,7 +116,7 @@ class ScoreStage:
         identity, protocol = self.folder.identity, self.scorer.scene.protocol
         parts = [bench_code(protocol), *(identity[k] for k in ("protocol_digest", "scene", "data", "body"))]
         for preset in self.scorer.presets:
-            parts += [*preset.identities(protocol.regions, protocol.image.background), *preset.lacking()]
+            parts += [*preset.identities(protocol.metrics.regions, protocol.image.background), *preset.lacking()]
         digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
         return self.runs / "calibration" / f"{digest}.jsonl"
 

@@ -14,7 +14,7 @@ def capture_digest(capture: Capture, protocol: Protocol) -> str:
     """Hash of the cameras, body poses, images and masks that the protocol uses of a capture."""
     digest = hashlib.sha256()
     n_frames = capture.n_frames
-    trained = [(protocol.train_camera, frame) for frame in protocol.training_frames(capture.name, n_frames)]
+    trained = [(protocol.train.camera, frame) for frame in protocol.training_frames(capture.name, n_frames)]
     n_cameras = len(capture.camera_ids)
     tested = [(camera, frame) for camera, frame, _ in protocol.test_views(capture.name, n_frames, n_cameras)]
     views = [(camera, frame) for camera, frame in trained + tested if frame < n_frames]
@@ -28,5 +28,5 @@ def capture_digest(capture: Capture, protocol: Protocol) -> str:
         for value in (pose.pose, pose.betas, pose.transl):
             digest.update(np.ascontiguousarray(value).tobytes())
     for camera, frame in views:
-        digest.update(capture.content_digest(camera, frame, protocol.silhouette))
+        digest.update(capture.content_digest(camera, frame, protocol.subjects.silhouette))
     return digest.hexdigest()[:10]

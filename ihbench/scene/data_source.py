@@ -134,13 +134,13 @@ def locate(protocol: Protocol, data: Path | None, scenes: tuple[str, ...]) -> Da
     if root is not None:
         found = open_dataset(protocol.dataset, root).subjects()
         scenes = tuple(unicodedata.normalize("NFC", scene) if scene not in found else scene for scene in scenes)
-        known = [s for s in protocol.subjects if s in found] or found
+        known = [s for s in protocol.subjects.names if s in found] or found
         return DataSource(protocol, root, False, _chosen(scenes, known, found, f"in {root}"))
     if protocol.dataset not in registry.names("stand-in"):
         raise BadInput(
             f"protocol {protocol.name}: data set {protocol.dataset!r} has no stand-in; give your copy with --data"
         )
-    known = list(protocol.standin_subjects)
+    known = list(protocol.subjects.standin)
     cast = registry.load("stand-in", protocol.dataset).subjects(LARGEST_CAST)
     found = [*known, *(scene for scene in scenes if scene in cast and scene not in known)]
     root = standin_root(protocol.dataset)
@@ -193,9 +193,9 @@ def body_file(named: Path, gender: str) -> Path:
 def wanted_frames(protocol: Protocol, standin: type) -> dict[int, list[int]]:
     """Camera index -> frames that a protocol reads of every stand-in subject."""
     n_frames, n_cameras = standin.n_frames, standin.n_cameras
-    wanted: dict[int, set[int]] = {protocol.train_camera: set()}
+    wanted: dict[int, set[int]] = {protocol.train.camera: set()}
     for subject in standin.subjects(1):  # all of a cast have the same frames
-        wanted[protocol.train_camera] |= set(protocol.training_frames(subject, n_frames))
+        wanted[protocol.train.camera] |= set(protocol.training_frames(subject, n_frames))
         for camera, frame, _ in protocol.test_views(subject, n_frames, n_cameras):
             wanted.setdefault(camera, set()).add(frame)
     return {camera: sorted(frames) for camera, frames in wanted.items()}

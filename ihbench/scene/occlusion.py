@@ -127,7 +127,7 @@ def apply_rule(protocol: Protocol, capture: Capture) -> OcclusionPlan:
             covered=covered,
             width=view.width,
             height=view.height,
-            silhouette=lambda frame: capture.silhouette(camera, frame, protocol.silhouette),
+            silhouette=lambda frame: capture.silhouette(camera, frame, protocol.subjects.silhouette),
             body_mask=body_mask,
         )
 
@@ -137,7 +137,7 @@ def apply_rule(protocol: Protocol, capture: Capture) -> OcclusionPlan:
         own = sorted({frame for k, frame, _ in views if k == camera})
         return rule(request(camera, own, [True] * len(own)))
 
-    training = request(protocol.train_camera, frames, covered)
+    training = request(protocol.train.camera, frames, covered)
     return OcclusionPlan(
         rule(training),
         tuple(frames),

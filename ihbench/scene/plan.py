@@ -135,7 +135,7 @@ def _mask_view(capture: Capture, protocol: Protocol, hiding: OcclusionPlan, k: i
     state = np.where(hiding.silhouette(frame), MaskState.PERSON, MaskState.BACKGROUND).astype(np.uint8)
     if hiding.covered[k]:
         state[hiding.occlusion.hidden(frame)] = MaskState.UNKNOWN
-    camera = capture.camera(protocol.train_camera)
+    camera = capture.camera(protocol.train.camera)
     step = max(1, camera.width // MEASURE_SIZE)
     state = np.ascontiguousarray(state[step // 2 :: step, step // 2 :: step])
     return _MaskView(state, camera.scaled(state.shape[1], state.shape[0]), capture.body_pose(frame))

@@ -266,7 +266,7 @@ def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
     protocol.check_views(capture.name, capture.n_frames, n_cameras, f"{capture.dataset} {capture.name}")
     hiding = apply_rule(protocol, capture)
     frames, covered = hiding.frames, hiding.covered
-    lenses = {protocol.train_camera: Undistorter(capture.camera(protocol.train_camera), protocol.image)}
+    lenses = {protocol.train.camera: Undistorter(capture.camera(protocol.train.camera), protocol.image)}
     last_touched: dict[int, tuple[NDArray[np.bool_], NDArray[np.bool_]]] = {}  # most rules hide the same every time
 
     def hidden_of(frame: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -274,17 +274,17 @@ def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
         hidden = hiding.occlusion.hidden(frame)
         known = last_touched.get(0)
         if known is None or known[0] is not hidden:
-            touched = lenses[protocol.train_camera].touched(np.ascontiguousarray(hidden))
+            touched = lenses[protocol.train.camera].touched(np.ascontiguousarray(hidden))
             known = last_touched[0] = (hidden, touched)
         return known
 
     def silhouette(camera: int, frame: int) -> NDArray[np.bool_]:
-        return capture.silhouette(camera, frame, protocol.silhouette)
+        return capture.silhouette(camera, frame, protocol.subjects.silhouette)
 
     def train_view(k: int) -> TrainView:
-        lens, frame = lenses[protocol.train_camera], frames[k]
-        person = silhouette(protocol.train_camera, frame)
-        image = capture.image(protocol.train_camera, frame)
+        lens, frame = lenses[protocol.train.camera], frames[k]
+        person = silhouette(protocol.train.camera, frame)
+        image = capture.image(protocol.train.camera, frame)
         unknown = [lens.cut_off(capture.model, capture.body_pose(frame))] if lens.unphotographed is not None else []
         if covered[k]:
             hidden, touched = hidden_of(frame)
@@ -299,7 +299,7 @@ def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
                 state[pixels] = MaskState.UNKNOWN
                 image[pixels] = lens.background
         return TrainView(
-            image, state, lens.camera, capture.body_pose(frame), frame, capture.camera_ids[protocol.train_camera]
+            image, state, lens.camera, capture.body_pose(frame), frame, capture.camera_ids[protocol.train.camera]
         )
 
     keys = test_view_keys(protocol, capture.name, capture.n_frames, capture.camera_ids)
@@ -341,4 +341,4 @@ def uncovered(scene: OccludedScene) -> OccludedScene:
             f"{scene.capture.dataset} {scene.capture.name}: the occluder of {scene.protocol.name} stands in the "
             "scene, nobody knows what is behind it; name a rule that draws its occluder"
         )
-    return open_scene(scene.capture, scene.protocol.with_occlusion("none"))
+    return open_scene(scene.capture, scene.protocol.with_fields({"occlusion.rule": "none"}))

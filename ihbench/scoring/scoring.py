@@ -85,7 +85,7 @@ class Scorer:
         """
         from ihbench.body.uv import texel_table
 
-        found = tuple(find_preset(name) for name in presets or scene.protocol.presets)
+        found = tuple(find_preset(name) for name in presets or scene.protocol.metrics.presets)
         texels = texel_table(body, VISIBILITY_TEXELS)
         visibility = texel_visibility(scene.train, body, texels)
         return cls(scene, SurfaceMap.build(body, texels, visibility), texels, visibility, found)
@@ -98,14 +98,14 @@ class Scorer:
     @cached_property
     def region_names(self) -> tuple[str, ...]:
         """The protocol's regions, and those that the presets take or need beside them."""
-        names = list(self.scene.protocol.regions)
+        names = list(self.scene.protocol.metrics.regions)
         for preset in self.presets:
             names += [*preset.regions(names), *preset.needs]
         return tuple(dict.fromkeys(names))
 
     def load(self, index: int) -> LoadedView:
         view = self.scene.test[index]
-        regions = self.surface.regions(view, self.region_names, self.scene.protocol.box_padding)
+        regions = self.surface.regions(view, self.region_names, self.scene.protocol.metrics.box_padding)
         return LoadedView(index, self.scene.test_keys[index], view, regions)
 
     def score(self, loaded: LoadedView, image: NDArray | None, slow: bool = True) -> ViewScores:
@@ -120,7 +120,7 @@ class Scorer:
                 image = _with_truth(image, loaded.view.image, loaded.view.hidden)
         for preset in self.presets:
             if image is None:
-                scores |= preset.absent(protocol.regions, background, "no prediction of this view")
+                scores |= preset.absent(protocol.metrics.regions, background, "no prediction of this view")
             else:
                 scores |= evaluate(
                     image,
@@ -129,7 +129,7 @@ class Scorer:
                     preset,
                     background,
                     slow,
-                    protocol.regions,
+                    protocol.metrics.regions,
                     self.withheld,
                     hdr=True,  # `as_prediction` has looked at the range
                 )

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ihbench.body import texel_table
 from ihbench.camera import Camera
 from ihbench.clock.ledger import Ledger
+from ihbench.config_fields import replaced
 from ihbench.data.data_check import fitness
 from ihbench.errors import BadInput
 from ihbench.files.atomic import read_json, write_json
@@ -115,7 +116,7 @@ def _all_hidden_regions() -> Answer:
     """With every frame hidden the body has no visible pixel, and hidden and never seen share it."""
     capture = turning_capture(FRAMES)
     protocol = protocol_for(capture, strip=EVERYTHING)
-    protocol = replace(protocol, occlusion=replace(protocol.occlusion, covers_fraction=1.0))
+    protocol = replaced(protocol, {"occlusion.covers.fraction": 1.0})
     scorer = _scorer(capture, protocol)
     found = []
     for index in range(len(scorer.scene.test_keys)):
@@ -129,7 +130,7 @@ def _hidden_share(fraction: float) -> Answer:
     """The strip for all of the person hides all of it, that for none nothing."""
     capture = turning_capture(FRAMES)
     protocol = protocol_for(capture)
-    protocol = replace(protocol, occlusion=replace(protocol.occlusion, fraction=fraction))
+    protocol = replaced(protocol, {"occlusion.fraction": fraction})
     return Answer(apply_rule(protocol, capture).hidden_share(), fraction)
 
 
@@ -145,13 +146,13 @@ def _one_camera() -> Answer:
     """The only camera trains, and none is left to test on."""
     capture = turning_capture(FRAMES)
     capture = replace(capture, cameras=capture.cameras[:1])
-    protocol = replace(protocol_for(capture), test_cameras=Span(1, 4, 1))
+    protocol = replaced(protocol_for(capture), {"test.cameras.start": 1})
     return Answer(words_of(BadInput, lambda: open_scene(capture, protocol)), "leaves no test view")
 
 
 def _missing(what: str, change: dict[str, Any]) -> Answer:
     capture = turning_capture(FRAMES)
-    protocol = replace(protocol_for(capture), **change)
+    protocol = replaced(protocol_for(capture), change)
     return Answer(words_of(BadInput, lambda: open_scene(capture, protocol)), what)
 
 
@@ -362,9 +363,9 @@ CASES = [
           _one_frame),
     _data("one-camera", "one camera", "words", 0, REFUSED, _one_camera),
     _data("camera-missing", "the training camera is not there", "words", 0, REFUSED,
-          partial(_missing, "training needs camera index 9", {"train_camera": 9})),
+          partial(_missing, "training needs camera index 9", {"train.camera": 9})),
     _data("frames-missing", "frames that are not there", "words", 0, REFUSED,
-          partial(_missing, "has 5 frames", {"test_frames": Span(0, 9, 1)})),
+          partial(_missing, "has 5 frames", {"test.frames": Span(0, 9, 1)})),
     _data("short-capture", "a capture a frame too short is told apart from a fit one", "words", 0, REFUSED,
           _short_capture),
     _data("body-behind-camera", "a body behind the training camera", "absolute", 0, COUNT, _behind_camera),

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ihbench.body import JOINT_INDEX, Body, load_body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera, look_at
+from ihbench.config_fields import replaced
 from ihbench.render.zbuffer import Raster, rasterize
 from ihbench.scene.contracts import MaskState, TrainView
 from ihbench.scene.protocol import Protocol, Span, load_protocol
@@ -155,20 +156,18 @@ def small_protocol(
 ) -> Protocol:
     """A registered protocol cut down to a drawn capture: every frame trains, every third tests, on all cameras."""
     protocol = load_protocol(base, "paper")
-    strips = {subject: strip} if strip else {}
-    return replace(
+    return replaced(
         protocol,
-        train_frames=Span(0, n_frames, 1),
-        test_frames=Span(0, n_frames, 3),
-        test_cameras=Span(0, 4, 1),
-        occlusion=replace(
-            protocol.occlusion,
-            rule="fixed-strip" if strip else rule,
-            unlisted=rule,
-            strips=strips,
-            reference_width=width,
-        ),
-        image=replace(protocol.image, size=size),
+        {
+            "train.frames": Span(0, n_frames, 1),
+            "test.frames": Span(0, n_frames, 3),
+            "test.cameras.stop": 4,
+            "occlusion.rule": "fixed-strip" if strip else rule,
+            "occlusion.unlisted": rule,
+            "occlusion.strips": {subject: strip} if strip else {},
+            "occlusion.reference_width": width,
+            "image.size": size,
+        },
     )
 
 

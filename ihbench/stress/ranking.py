@@ -101,7 +101,7 @@ def field(background: Color = WHITE) -> tuple[Frame, ...]:
     for index in (0, 2, 3, 5):
         view = scorer.load(index).view
         names = ("full", "box", "body", "visible", "hidden", "never_seen", "box+0.05", "box+0.3")
-        regions = scorer.surface.regions(view, names, protocol.box_padding)
+        regions = scorer.surface.regions(view, names, protocol.metrics.box_padding)
         images = spoiled(view.image, view.silhouette, paint, index)
         images |= {row: calibration.predict(row, view) for row in ROWS}
         frames.append(Frame(view.image, regions, images))

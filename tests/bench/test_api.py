@@ -190,6 +190,6 @@ def test_no_request_is_made_of_what_no_function_takes(wrong):
 
 def test_a_span_of_any_size_is_refused_before_it_is_listed(studio):
     """A list of 10^15 frames would take the memory of the machine."""
-    protocol = load_protocol(str(studio.protocol)).with_frames("0:1000000000000000", None)
+    protocol = load_protocol(str(studio.protocol)).with_fields({"train.frames": "0:1000000000000000"})
     with studio.in_its_world(), pytest.raises(BadInput, match="needs frame 999999999999999"):
         locate(protocol, None, ("standin-1",)).open("standin-1", None, QUIET)

@@ -11,7 +11,7 @@ RAW = 10_000  # more frames than any subject has: the protocol's own limits rule
 
 def test_zju_occ_trains_on_100_frames_of_which_80_are_covered():
     protocol = load_protocol("zju_occ", "paper")
-    for subject in protocol.subjects:
+    for subject in protocol.subjects.names:
         frames = protocol.training_frames(subject, RAW)
         assert frames == list(range(0, 500, 5))
         assert sum(protocol.covered(subject, frames, RAW)) == 80
@@ -51,8 +51,8 @@ def test_the_two_readings_disagree_on_exactly_two_strips():
 @pytest.mark.parametrize("profile", ["quick", "paper"])
 def test_every_shipped_protocol_reads_and_tests_on_no_view_that_it_trains_on(name, profile):
     protocol = load_protocol(name, profile)
-    for subject in (*protocol.subjects, *protocol.standin_subjects, "anybody"):
-        trained = {(protocol.train_camera, frame) for frame in protocol.training_frames(subject, 1000)}
+    for subject in (*protocol.subjects.names, *protocol.subjects.standin, "anybody"):
+        trained = {(protocol.train.camera, frame) for frame in protocol.training_frames(subject, 1000)}
         assert trained
         groups = {}
         for camera, frame, group in protocol.test_views(subject, 1000, 23):

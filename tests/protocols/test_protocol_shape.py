@@ -7,9 +7,9 @@ from copy import deepcopy
 import pytest
 
 from ihbench import registry
+from ihbench.config_fields import read
 from ihbench.errors import BadInput
-from ihbench.scene.protocol import PROFILES, load_protocol, read_protocol
-from ihbench.scene.protocol_shape import check_protocol
+from ihbench.scene.protocol import PROFILES, ProtocolFile, load_protocol, read_protocol
 
 
 @pytest.fixture
@@ -59,12 +59,12 @@ FINE = {
 def test_every_registered_protocol_has_this_shape():
     for name in registry.names("protocol"):
         for profile in PROFILES:
-            check_protocol(load_protocol(name, profile).content, name)
+            read(ProtocolFile, load_protocol(name, profile).content, name)
 
 
 def refusal(content):
     try:
-        check_protocol(content, "p.toml")
+        read(ProtocolFile, content, "p.toml")
     except BadInput as error:
         return str(error)
     return ""

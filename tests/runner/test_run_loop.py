@@ -240,7 +240,7 @@ def test_only_occluded_frames_have_unknown_pixels_and_none_without_an_occluder(s
         capture, _ = locate(protocol, None, ("standin-1",)).open("standin-1", None, Progress.silent())
     unknown = {
         rule.occlusion.rule: [bool((v.mask == MaskState.UNKNOWN).any()) for v in open_scene(capture, rule).train]
-        for rule in (protocol, protocol.with_occlusion("none"))
+        for rule in (protocol, protocol.with_fields({"occlusion.rule": "none"}))
     }
     assert unknown == {"fixed-strip": [True] * 4 + [False], "none": [False] * 5}
 

@@ -37,7 +37,7 @@ def own_video(tmp_path_factory):
 def test_any_person_of_a_stand_in_can_be_named():
     protocol = load_protocol("people_snapshot_occ", "quick")
     assert locate(protocol, None, ("standin-8", "standin-2")).scenes == ("standin-8", "standin-2")
-    assert locate(protocol, None, ()).scenes == protocol.standin_subjects
+    assert locate(protocol, None, ()).scenes == protocol.subjects.standin
     for name in ("standin-0", "standin-08", "standin-100", "male-3-casual"):
         with pytest.raises(BadInput, match=f"unknown scene '{name}'"):
             locate(protocol, None, (name,))
@@ -71,7 +71,7 @@ def test_a_video_of_ones_own_runs_with_its_own_body(own_video, tmp_path, mannequ
 
 
 def test_frames_are_flags(own_video):
-    protocol = load_protocol("custom_occ").with_frames("0:8:4", "1::3")
+    protocol = load_protocol("custom_occ").with_fields({"train.frames": "0:8:4", "test.frames": "1::3"})
     scene = open_scene(*_opened(protocol, own_video))
     assert scene.hiding.frames == (0, 4)
     assert [key.frame for key in scene.test_keys] == [1, 4, 7]
@@ -79,7 +79,7 @@ def test_frames_are_flags(own_video):
     assert protocol.digest != load_protocol("custom_occ").digest
     for bad in ("a:b", "5", "3:1", "0:9:0", "-1:5"):
         with pytest.raises(BadInput, match=r"START:STOP:STEP|stop above"):
-            load_protocol("custom_occ").with_frames(train=bad)
+            load_protocol("custom_occ").with_fields({"train.frames": bad})
 
 
 def _opened(protocol, data, scene=None):
@@ -95,7 +95,9 @@ def test_severity_asked_is_severity_hidden(bench, rule):
     """On a stand-in, within 2 % of the person; the strip is as coarse as two of its columns."""
     with bench.in_its_world():
         for fraction in (0.1, 0.3, 0.5, 0.7, 0.9):
-            protocol = load_protocol(str(bench.protocol)).with_occlusion(rule, fraction)
+            protocol = load_protocol(str(bench.protocol)).with_fields(
+                {"occlusion.rule": rule, "occlusion.fraction": fraction}
+            )
             hidden = open_scene(*_opened(protocol, None, "standin-1")).hiding.hidden_share()
             assert fraction <= hidden <= fraction + 0.02, (fraction, hidden)
 
@@ -230,12 +232,12 @@ def test_a_large_capture_opens_without_decoding_an_image(tmp_path, monkeypatch):
 
 def test_another_image_size_is_the_same_protocol_but_for_its_images():
     protocol = load_protocol("zju_occ")
-    small = protocol.with_size(64)
+    small = protocol.with_fields({"image.size": 64})
     assert (small.image.size, small.name) == (64, f"{protocol.name}+size=64")
     assert small.digest != protocol.digest
-    assert small.with_size(protocol.image.size).digest == protocol.digest
-    assert protocol.with_size(None) is protocol.with_size(protocol.image.size) is protocol
-    assert small.with_occlusion("none").name == f"{protocol.name}+size=64+occlusion=none"
+    assert small.with_fields({"image.size": 256}).digest == protocol.digest
+    assert protocol.with_fields({}) is protocol.with_fields({"image.size": 256}) is protocol
+    assert small.with_fields({"occlusion.rule": "none"}).name == f"{protocol.name}+size=64+occlusion=none"
     for bad in (7, 8193):
-        with pytest.raises(BadInput, match="--image-size"):
-            protocol.with_size(bad)
+        with pytest.raises(BadInput, match=r"--protocol\.image\.size: expected"):
+            protocol.with_fields({"image.size": bad})

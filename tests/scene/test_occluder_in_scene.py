@@ -18,10 +18,10 @@ from ihbench.scene.occlusion import Occlusion, occluder
 from ihbench.scene.protocol import load_protocol, protocol_from, read_protocol
 from ihbench.scene.views import open_scene, uncovered
 from ihbench.scoring.scoring import Scorer
-
-from .fake_capture import DISTORTION, fake_protocol, rasterized, the_body, turning_capture
+from tests.bench.fake_capture import DISTORTION, fake_protocol, rasterized, the_body, turning_capture
 
 PINCUSHION = np.array([0.25, 0.05, 0, 0, 0])
+RULE, FRACTION, COVERS = "occlusion.rule", "occlusion.fraction", "occlusion.covers.fraction"
 TABLE = slice(45, 62)  # rows of the original image: before the hips
 PRESETS = (
     "ihbench",
@@ -199,19 +199,19 @@ def test_the_occluder_covers_every_frame_and_the_protocol_says_so(curtain):
     protocol = load_protocol("custom_occ")
     assert protocol.content["occlusion"]["covers"]["fraction"] == 0.8
     for rule in ("natural", curtain):
-        standing = protocol.with_occlusion(rule)
+        standing = protocol.with_fields({RULE: rule})
         assert standing.content["occlusion"] | {"in_scene": True} == standing.content["occlusion"]
-        assert standing.occlusion.covers_fraction == 1
+        assert standing.occlusion.covers.fraction == 1
         assert standing.name == f"custom_occ@1+occlusion={rule}"
-        assert protocol.with_occlusion(rule, covers=1.0).name == standing.name
-        assert standing.with_occlusion(covers=1.0) is standing
-        back = standing.with_occlusion("strip-generic", 0.5, 0.8)
+        assert protocol.with_fields({RULE: rule, COVERS: 1.0}).name == standing.name
+        assert standing.with_fields({COVERS: 1.0}) is standing
+        back = standing.with_fields({RULE: "strip-generic", FRACTION: 0.5, COVERS: 0.8})
         assert back.digest == protocol.digest
-        for fraction, covers in ((None, 0.8), (None, 0.0), (0.5, None)):
+        for change in ({COVERS: 0.8}, {COVERS: 0.0}, {FRACTION: 0.5}):
             with pytest.raises(BadInput, match="leave it out"):
-                protocol.with_occlusion(rule, fraction, covers)
+                protocol.with_fields({RULE: rule} | change)
             with pytest.raises(BadInput, match="leave it out"):
-                standing.with_occlusion(None, fraction, covers)
+                standing.with_fields(change)
     released = load_protocol("ocmotion_visible")
     assert released.occlusion.in_scene
     assert released.name == "ocmotion_visible@2"
@@ -221,8 +221,8 @@ def test_the_occluder_covers_every_frame_and_the_protocol_says_so(curtain):
 @pytest.mark.parametrize("rule", ["none", "fixed-strip"])
 def test_a_rule_that_knows_no_fraction_is_not_swept(rule):
     with pytest.raises(BadInput, match="whatever the fraction"):
-        load_protocol("zju_occ").with_occlusion(rule, 0.3)
-    assert load_protocol("zju_occ").with_occlusion(fraction=0.3).occlusion.rule == "strip-generic"
+        load_protocol("zju_occ").with_fields({RULE: rule, FRACTION: 0.3})
+    assert load_protocol("zju_occ").with_fields({FRACTION: 0.3}).occlusion.rule == "strip-generic"
 
 
 @pytest.mark.parametrize(
@@ -254,9 +254,9 @@ def test_a_headline_without_a_number_is_refused(tmp_path):
     text = (registry.package_folder("protocol", "custom_occ") / "custom_occ.toml").read_text(encoding="utf-8")
     path = tmp_path / "mine.toml"
     path.write_text(text.replace('headline = "body"', 'headline = "full"'), encoding="utf-8")
-    assert read_protocol(path).headline == "full"
+    assert read_protocol(path).metrics.headline == "full"
     with pytest.raises(BadInput, match="headline is 'full'"):
-        read_protocol(path).with_occlusion("natural")
+        read_protocol(path).with_fields({RULE: "natural"})
 
 
 def test_a_third_party_rule_is_treated_alike(curtain):

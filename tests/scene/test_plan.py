@@ -32,10 +32,19 @@ from ihbench.scene.plan import (
 from ihbench.scene.protocol import REGIONS
 from ihbench.scene.views import open_scene
 from ihbench.scene.visibility import texel_visibility
+from tests.bench.fake_capture import (
+    DISTANCE,
+    DISTORTION,
+    FOCAL,
+    SIZE,
+    FakeCapture,
+    a_camera,
+    a_pose,
+    fake_protocol,
+    the_body,
+)
+from tests.bench.fake_capture import turning_capture as turning
 from tests.reports.fake_runs import identity
-
-from .fake_capture import DISTANCE, DISTORTION, FOCAL, SIZE, FakeCapture, a_camera, a_pose, fake_protocol, the_body
-from .fake_capture import turning_capture as turning
 
 BODY = the_body()
 

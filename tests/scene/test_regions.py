@@ -11,8 +11,7 @@ from ihbench.camera import look_at
 from ihbench.scene.protocol import REGIONS
 from ihbench.scene.regions import SurfaceMap, projected_box
 from ihbench.scene.visibility import Visibility, texel_visibility
-
-from .fake_capture import SIZE, a_camera, a_pose, rasterized, the_body, train_view, truth_view
+from tests.bench.fake_capture import SIZE, a_camera, a_pose, rasterized, the_body, train_view, truth_view
 
 BODY = the_body()
 TEXELS = texel_table(BODY, 128)

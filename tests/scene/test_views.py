@@ -10,12 +10,20 @@ import pytest
 
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera, distort
+from ihbench.config_fields import replaced
 from ihbench.errors import BadInput
 from ihbench.scene.contracts import MaskState
 from ihbench.scene.protocol import Span, load_protocol
 from ihbench.scene.views import LazyViews, TestViewKey, Undistorter, open_scene
-
-from .fake_capture import DISTORTION, SIZE, FakeCapture, a_camera, fake_protocol, rasterized, turning_capture
+from tests.bench.fake_capture import (
+    DISTORTION,
+    SIZE,
+    FakeCapture,
+    a_camera,
+    fake_protocol,
+    rasterized,
+    turning_capture,
+)
 
 STRIP = (47, 9)  # mid, width: columns 43 ... 50 of the original image
 COLUMNS = slice(43, 51)
@@ -84,8 +92,8 @@ def blank_capture(name, distortion=None):
 def published(base):
     protocol = fake_protocol(base, n_frames=2, size=512)
     strips = load_protocol(base, "paper").occlusion.strips
-    rule = replace(protocol.occlusion, rule="fixed-strip", strips=strips, reference_width=1024, covers_fraction=1.0)
-    return replace(protocol, occlusion=rule)
+    rule = {"rule": "fixed-strip", "strips": strips, "reference_width": 1024, "covers.fraction": 1.0}
+    return replaced(protocol, {f"occlusion.{name}": value for name, value in rule.items()})
 
 
 @pytest.mark.parametrize(
@@ -140,7 +148,7 @@ def undistorted(capture, image):
 @pytest.mark.parametrize("background", [(1.0, 1.0, 1.0), (0.0, 0.0, 0.0), (0.2, 0.4, 0.6)])
 def test_background_is_painted_exactly(capture, background):
     protocol = fake_protocol(strip=STRIP)
-    protocol = replace(protocol, image=replace(protocol.image, background=background))
+    protocol = replaced(protocol, {"image.background": background})
     scene = open_scene(capture, protocol)
     for view in scene.train:
         person = undistorted(capture, 255 * capture.silhouette(0, view.frame).astype(np.uint8)) > 0
@@ -154,7 +162,7 @@ def test_background_is_painted_exactly(capture, background):
 def test_hidden_pixels_have_the_very_colour_of_the_background(base, background):
     """Whatever the rounding: a step between the two would draw the occluder's outline."""
     protocol = fake_protocol(base, strip=STRIP)
-    protocol = replace(protocol, image=replace(protocol.image, background=background))
+    protocol = replaced(protocol, {"image.background": background})
     view = open_scene(turning_capture(), protocol).train[0]
     assert (view.image[view.mask == MaskState.UNKNOWN] == view.image[0, 0]).all()
 
@@ -249,7 +257,7 @@ def test_truth_is_never_occluded_and_never_of_the_training_camera(capture):
     assert len(scene.test) == len(scene.test_keys) == 12
     for key, view, other in zip(scene.test_keys, scene.test, bare.test, strict=True):
         assert (view.frame, view.camera_id) == (key.frame, key.camera_id)
-        assert key.camera != scene.protocol.train_camera
+        assert key.camera != scene.protocol.train.camera
         assert view.camera.R.tolist() == capture.camera(key.camera).R.tolist()
         assert np.array_equal(view.image, other.image)
         assert np.array_equal(view.silhouette, other.silhouette)
@@ -259,7 +267,9 @@ def test_truth_is_never_occluded_and_never_of_the_training_camera(capture):
 
 
 def test_views_carry_what_they_were_taken_with(capture):
-    scene = open_scene(capture, replace(fake_protocol(strip=STRIP), train_frames=Span(1, 10, 3), train_camera=2))
+    scene = open_scene(
+        capture, replaced(fake_protocol(strip=STRIP), {"train.frames": Span(1, 10, 3), "train.camera": 2})
+    )
     assert [view.frame for view in scene.train] == [1, 4, 7]
     assert scene.hiding.covered == (True, True, True)
     assert {view.camera_id for view in scene.train} == {"cam2"}
@@ -273,23 +283,25 @@ def test_views_carry_what_they_were_taken_with(capture):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"train_frames": Span(0, 11, 1)}, "needs frame 10"),
-        ({"test_frames": Span(0, 40, 15)}, "needs frame 30"),
-        ({"train_camera": 4}, "camera index 4"),
-        ({"test_cameras": Span(0, 1, 1)}, "no test view"),
-        ({"test_cameras": Span(5, 9, 1)}, "no test view"),
+        ({"train.frames": Span(0, 11, 1)}, "needs frame 10"),
+        ({"test.frames": Span(0, 40, 15)}, "needs frame 30"),
+        ({"train.camera": 4}, "camera index 4"),
+        ({"test.cameras.stop": 1}, "no test view"),
+        ({"test.cameras.start": 5, "test.cameras.stop": 9}, "no test view"),
     ],
 )
 def test_a_capture_that_lacks_frames_or_cameras_is_refused(change, words):
     with pytest.raises(BadInput, match=words) as caught:
-        open_scene(turning_capture(), replace(fake_protocol(), **change))
+        open_scene(turning_capture(), replaced(fake_protocol(), change))
     assert "\n" not in str(caught.value)
     assert "drawn" in str(caught.value)
 
 
 def test_a_protocol_without_a_training_frame_is_refused():
     with pytest.raises(BadInput, match="drawn"):
-        open_scene(turning_capture(), replace(fake_protocol(rule="none"), train_frames=Span(10, "max_frames", 1)))
+        open_scene(
+            turning_capture(), replaced(fake_protocol(rule="none"), {"train.frames": Span(10, "max_frames", 1)})
+        )
 
 
 # ----------------------------------------------------------------------------------------------- LazyViews
@@ -403,7 +415,7 @@ def test_strip_generic_hides_half_and_hardly_more(capture):
 
 def test_nothing_covered_hides_nothing():
     protocol = fake_protocol(rule="none")
-    protocol = replace(protocol, occlusion=replace(protocol.occlusion, covers_fraction=0.0))
+    protocol = replaced(protocol, {"occlusion.covers.fraction": 0.0})
     scene = open_scene(turning_capture(), protocol)
     assert not any(scene.hiding.covered)
     assert scene.hiding.hidden_share() == 0.0

@@ -10,8 +10,7 @@ from ihbench.body.pose import BodyPose
 from ihbench.camera import look_at
 from ihbench.scene.contracts import MaskState
 from ihbench.scene.visibility import FACING, surface_texels, texel_visibility
-
-from .fake_capture import DISTORTION, SIZE, a_camera, a_pose, the_body, train_view
+from tests.bench.fake_capture import DISTORTION, SIZE, a_camera, a_pose, the_body, train_view
 
 RESOLUTION = 64
 BODY = the_body()

@@ -9,8 +9,7 @@ from ihbench.body import texel_table
 from ihbench.metrics import psnr
 from ihbench.scene.contracts import MaskState
 from ihbench.scoring.calibration import DESCRIPTIONS, ROWS, Calibration
-
-from .fake_capture import SIZE, WHITE, a_camera, a_pose, rasterized, the_body, train_view, truth_view
+from tests.bench.fake_capture import SIZE, WHITE, a_camera, a_pose, rasterized, the_body, train_view, truth_view
 
 BODY = the_body()
 TEXELS = texel_table(BODY, 256)

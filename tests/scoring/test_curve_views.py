@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ihbench.config_fields import replaced
 from ihbench.metrics import mean_over_frames
-from ihbench.scene.protocol import Span, TestGroup
+from ihbench.scene.protocol import Cameras, Span, TestCameras, TestGroup
 from ihbench.scene.views import open_scene
 from ihbench.scoring.calibration import Calibration
 from ihbench.scoring.curve_views import curve_views, representatives
 from ihbench.scoring.scoring import Scorer
-
-from .fake_capture import a_camera, fake_protocol, the_body, turning_capture
+from tests.bench.fake_capture import a_camera, fake_protocol, the_body, turning_capture
 
 
 @settings(max_examples=40, deadline=None)
@@ -48,7 +48,7 @@ def studio(request):
     capture = turning_capture(20, turn)
     capture = replace(capture, cameras=[a_camera(2 * np.pi * k / 11) for k in range(11)])
     protocol = fake_protocol("zju_occ", 20, 48, rule)
-    protocol = replace(protocol, test_frames=Span(0, 20, 4), test_cameras=Span(0, 11, 1), test_except_train=False)
+    protocol = replaced(protocol, {"test.frames": Span(0, 20, 4), "test.cameras": TestCameras(0, 11, 1, False)})
     scorer = Scorer.build(open_scene(capture, protocol), the_body())
     pasted = Calibration.build(scorer.scene.train, the_body(), scorer.texels, (1.0, 1.0, 1.0))
     rows = {"pasted": lambda loaded: pasted.predict("pasted-texture", loaded.view)}
@@ -79,7 +79,7 @@ def test_the_curve_ends_near_the_table(studio):
 def test_of_few_views_all_are_taken_and_groups_stand_apart():
     capture = turning_capture(10)
     protocol = fake_protocol("zju_occ", 10)
-    protocol = replace(protocol, also=(TestGroup("again", Span(0, 4, 1), Span(0, 10, 1)),))
+    protocol = replace(protocol, also=(TestGroup("again", Cameras(0, 4, 1), Span(0, 10, 1)),))
     scorer = Scorer.build(open_scene(capture, protocol), the_body())
     own = sum(not key.group for key in scorer.scene.test_keys)
     assert own < len(scorer.scene.test_keys)

@@ -14,8 +14,7 @@ from ihbench.scene.views import open_scene
 from ihbench.scene.visibility import texel_visibility
 from ihbench.scoring import scoring
 from ihbench.scoring.scoring import Scorer
-
-from .fake_capture import fake_protocol, the_body, turning_capture
+from tests.bench.fake_capture import fake_protocol, the_body, turning_capture
 
 BODY = the_body()
 
@@ -51,7 +50,7 @@ def test_the_truth_scores_perfectly_and_a_grey_image_does_not(scorer):
     best = scorer.score(loaded, loaded.view.image).scores
     grey = scorer.score(loaded, np.full_like(loaded.view.image, 0.5)).scores
     assert set(best) == set(grey)
-    assert {region_of(identity) for identity in best} == set(scorer.scene.protocol.regions)
+    assert {region_of(identity) for identity in best} == set(scorer.scene.protocol.metrics.regions)
     perfect = {"psnr": math.inf, "ssim": 1.0, "flip": 0.0}
     for identity, score in best.items():
         if not score.absent:

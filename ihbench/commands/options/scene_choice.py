@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
-from ihbench import registry
 from ihbench.bounds import IMAGE_SIZES, Within, refuse_repeated
 
 if TYPE_CHECKING:
@@ -39,12 +38,22 @@ class ProtocolChanges:
 
     def apply(self, protocol: Protocol) -> list[Protocol]:
         """The protocols that these options mean: one, or one for each severity. Raises `BadInput`."""
-        if self.occlusion.rule is not None:
-            registry.entry_point("occlusion", self.occlusion.rule)
-        protocol = protocol.with_frames(self.train_frames, self.test_frames).with_size(self.image_size)
         refuse_repeated(self.occlusion.fraction, "--occlusion.fraction")
-        fractions = self.occlusion.fraction or (None,)
-        return [protocol.with_occlusion(self.occlusion.rule, f, self.occlusion.covers) for f in fractions]
+        given = {name: value for name, (_, value) in self._short().items() if value is not None}
+        flags = {name: flag for name, (flag, _) in self._short().items()}
+        sweep = [{"occlusion.fraction": fraction} for fraction in self.occlusion.fraction] or [{}]
+        return [protocol.with_fields(given | severity, flags) for severity in sweep]
+
+    def _short(self) -> dict[str, tuple[str, Any]]:
+        """Choice of a protocol -> its short flag, and the value that it has."""
+        return {
+            "train.frames": ("--train-frames", self.train_frames),
+            "test.frames": ("--test-frames", self.test_frames),
+            "image.size": ("--image-size", self.image_size),
+            "occlusion.rule": ("--occlusion.rule", self.occlusion.rule),
+            "occlusion.fraction": ("--occlusion.fraction", None),  # several are a sweep
+            "occlusion.covers.fraction": ("--occlusion.covers", self.occlusion.covers),
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
