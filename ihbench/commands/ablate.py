@@ -22,7 +22,7 @@ from ihbench.errors import BadInput
 if TYPE_CHECKING:
     from ihbench.clock.progress import Progress
     from ihbench.runner.ablation import Ladder
-    from ihbench.runner.cells import Cell, CellOutcome
+    from ihbench.runner.executor import Cell, CellOutcome
     from ihbench.scene.data_source import DataSource
 
 BETWEEN = ":"  # values of one switch
@@ -83,7 +83,7 @@ def ablated(
     numbers, and how each run ended. The options' own words for both are not read. Raises `BadInput`."""
     from ihbench.clock.machine import usable_cores
     from ihbench.record import outputs
-    from ihbench.runner.cells import run_cells
+    from ihbench.runner.executor import run_cells
 
     if not chosen.seed:
         raise BadInput("--seed: expected one number or more")
@@ -187,7 +187,7 @@ def _value(chosen: AblateOptions, config: Any, name: str, text: str) -> Any:
 def _cells(chosen: AblateOptions, ladder: Ladder, progress: Any) -> list[tuple[str, Cell]]:
     """Rung and cell of every run: seeds outermost, so that an early table holds every rung."""
     from ihbench.runner.ablation import configured, kept, shared_part
-    from ihbench.runner.cells import Cell
+    from ihbench.runner.executor import Cell
     from ihbench.runner.run_loop import RunRequest
     from ihbench.scene.data_source import locate
     from ihbench.scene.protocol import load_protocol

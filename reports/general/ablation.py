@@ -16,7 +16,7 @@ from ihbench.record.results import RunResult
 from ihbench.reports.general.clock import clock_notes, one_clock
 from ihbench.reports.general.significance import ALPHA, LEVEL, per_scene
 from ihbench.runner.ablation import Comparison, Ladder
-from ihbench.runner.cells import CellOutcome
+from ihbench.runner.executor import CellOutcome
 
 REGIONS = ("visible", "hidden", "never_seen")  # beside the headline
 PAPER = {"psnr": ("PSNR", 2), "ssim": ("SSIM", 4), "lpips": ("LPIPS*", 2)}

@@ -11,7 +11,7 @@ from ihbench.clock import gpu_slots
 from ihbench.clock.gpu_slots import RUN_MEMORY, card_slots, free_memory, only
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
-from ihbench.runner.cells import Cell, run_cells
+from ihbench.runner.executor import Cell, run_cells
 
 GIB = 2**30
 
@@ -62,7 +62,7 @@ def test_cards_that_do_not_answer_are_bad_input(monkeypatch, code):
 
 def test_a_card_is_given_to_the_next_run_when_one_ends(monkeypatch):
     """Five runs on two cards: never two on one, each told its own by the environment alone."""
-    from ihbench.runner import cells as module
+    from ihbench.runner import executor as module
 
     shown, ends = [], []
 

@@ -49,15 +49,15 @@ sys.exit(cli.main(["run"]))
 WORKERS = """\
 import sys
 from pathlib import Path
-from ihbench.runner import cells
-from ihbench.runner.cells import Cell, run_cells
+from ihbench.runner import executor
+from ihbench.runner.executor import Cell, run_cells
 from ihbench.clock.progress import Progress
 
 def child(connection, request, source, scene, threads):
     from tests.clock.test_interruption import hold
     hold(Path(request), scene)
 
-cells._child = child
+executor._child = child
 if __name__ == "__main__":
     run_cells([Cell(s, sys.argv[1], None, s) for s in ("a", "b")], 2, 1, Progress.silent())
 """

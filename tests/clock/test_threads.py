@@ -40,7 +40,7 @@ def said(code, **variables):
         "from ihbench.metrics.lpips import *; import torch",
         "from ihbench.methods.inpainthuman.method import InpaintHuman",
         "from ihbench.datasets.plain.plain_scene import PlainScene; import torch",
-        "from ihbench.runner.cells import _child; import torch",
+        "from ihbench.runner.executor import _child; import torch",
         "from ihbench.cli import main; import torch",
         "import tests.conftest; import torch",
     ],

@@ -22,9 +22,9 @@ from ihbench.files.atomic import read_json
 from ihbench.methods.inpainthuman.config import LEAST_TEXELS, PROFILES, QUICK
 from ihbench.record.results import read_result
 from ihbench.record.store import RunFolder
-from ihbench.runner import cells as cells_module
+from ihbench.runner import executor as cells_module
 from ihbench.runner.ablation import Comparison, Ladder, Rung, configured, grid, kept, set_on_all, shared_part
-from ihbench.runner.cells import Cell, run_cells
+from ihbench.runner.executor import Cell, run_cells
 from ihbench.runner.run_loop import RunRequest, _planned
 from ihbench.runner.shared_states import lend, lender
 from ihbench.scene.data_source import DataSource

@@ -203,7 +203,7 @@ def test_without_the_module_that_windows_lacks(file):
     code = (
         "import sys; sys.modules['fcntl'] = None\n"
         "import ihbench.record.store, ihbench.record.index, ihbench.runner.recorded_run\n"
-        "import ihbench.data.prepare, ihbench.runner.cells\n" + HOLD
+        "import ihbench.data.prepare, ihbench.runner.executor\n" + HOLD
     )
     done = subprocess.run([sys.executable, "-c", code, str(file)], input="", capture_output=True, text=True)
     assert (done.stdout, done.stderr) == ("held\n", "")

@@ -270,7 +270,7 @@ def cut_short() -> Iterator[None]:
     places = (
         *(
             "ihbench.runner.run_loop.run_scene",
-            "ihbench.runner.cells.run_scene",
+            "ihbench.runner.executor.run_scene",
             "ihbench.metrics.oracles.check.check",
         ),
         *("ihbench.stress.run.run_cases", "ihbench.kernels.table.run_kernels", "ihbench.metrics.weights.fetch"),

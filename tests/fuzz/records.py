@@ -24,7 +24,7 @@ from ihbench.record.results import read_result
 from ihbench.record.store import RunFolder
 from ihbench.reports.general import ablation
 from ihbench.runner.ablation import Comparison, Ladder, Rung
-from ihbench.runner.cells import Cell, CellOutcome
+from ihbench.runner.executor import Cell, CellOutcome
 from ihbench.runner.shared_states import lend, lender
 from tests.reports.fake_runs import LPIPS, PSNR, SSIM, about, identity
 
