@@ -14,6 +14,7 @@ from ihbench.clock.interruption import interruptible
 from ihbench.commands import COMMANDS
 from ihbench.errors import BadInput
 from ihbench.record.provenance import description, note_command
+from ihbench.scene.method_spec import usable_specs
 from ihbench.version import __version__
 
 
@@ -25,8 +26,8 @@ def usage() -> str:
         "",
     ]
     lines += [f"  {name:<11}{what}" for name, what in COMMANDS.items()]
-    added = [name for name in registry.names("command") if name not in COMMANDS]
-    lines += [f"  {name:<11}{_summary(name)}" for name in added]
+    added = [item for spec in usable_specs() for item in spec.commands.items() if item[0] not in COMMANDS]
+    lines += [f"  {name:<11}{command.summary}" for name, command in added]
     lines += [
         "",
         "start here: ihbench run --protocol zju_occ --scene standin-1",
@@ -35,14 +36,6 @@ def usage() -> str:
         "             128 and the number of another signal that ended it: 143 for SIGTERM, 129 for SIGHUP",
     ]
     return "\n".join(lines)
-
-
-def _summary(name: str) -> str:
-    """What a registered command says of itself. One that cannot be loaded must not take the help away."""
-    try:
-        return registry.load("command", name).SUMMARY
-    except BadInput as error:
-        return str(error)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -81,11 +74,15 @@ def _run(argv: list[str]) -> int:
         return 0
     note_command(argv)
     if argv[0] in COMMANDS:
-        return import_module(f"ihbench.commands.{argv[0]}").main(argv[1:])
-    added = registry.names("command")  # by methods and by other packages
-    if argv[0] not in added:
-        raise BadInput(f"unknown command {argv[0]!r}: {registry.nearest(argv[0], [*COMMANDS, *added])}")
-    return registry.load("command", argv[0]).main(argv[1:])
+        return import_module(f"ihbench.commands.{argv[0].replace('-', '_')}").main(argv[1:])
+    specs = usable_specs()
+    owners = [spec for spec in specs if argv[0] in spec.commands]
+    if len(owners) > 1:
+        raise BadInput(f"command {argv[0]!r} is one of the methods {' and '.join(spec.name for spec in owners)}")
+    if not owners:
+        known = [*COMMANDS, *(name for spec in specs for name in spec.commands)]
+        raise BadInput(f"unknown command {argv[0]!r}: {registry.nearest(argv[0], known)}")
+    return owners[0].load(owners[0].commands[argv[0]].main)(argv[1:])
 
 
 def _tell(argv: list[str], failure: Failure) -> int:

@@ -16,28 +16,21 @@ from ihbench.errors import BadInput
 
 GROUPS = {
     "method": "ihbench.methods",
-    "config": "ihbench.configs",
     "dataset": "ihbench.datasets",
     "stand-in": "ihbench.standins",
     "training layout": "ihbench.training_layouts",
     "people": "ihbench.people",
-    "command": "ihbench.commands",
-    "ladder": "ihbench.ladders",
     "table": "ihbench.tables",
-    "stress cases": "ihbench.stress",
     "protocol": "ihbench.protocols",
     "occlusion": "ihbench.occlusions",
     "report": "ihbench.reports",
     "report verb": "ihbench.report_verbs",
     "figure": "ihbench.figures",
-    "kernel": "ihbench.kernels",
     "metric preset": "ihbench.presets",
 }
 
 ROOMS = ("methods", "datasets", "protocols", "reports")  # of the bench: content, found by name
 NEEDS = {  # attributes of what is registered
-    "config": ("PROFILES", "leave_out"),
-    "command": ("SUMMARY", "main"),
     "report verb": ("main",),
     "dataset": ("check",),
     "stand-in": ("version", "protocol", "subjects", "ensure", "n_frames", "n_cameras"),

@@ -25,6 +25,8 @@ from ihbench.cli import main
 from ihbench.scene.data_source import STANDIN_SEED, standin_root, wanted_frames
 from ihbench.scene.protocol import load_protocol
 
+OWN_METHOD = Path(__file__).parent / "examples" / "own_method"
+
 # 5 training views (4 of them occluded), 2 × 2 test views, 64 px
 TINY_PROFILE = """[profile.quick]
 image = { size = 64 }
@@ -150,18 +152,29 @@ def bench_with_run(bench: Bench, finished: Finished) -> Bench:
 
 @pytest.fixture
 def mannequin(monkeypatch: pytest.MonkeyPatch) -> str:
-    """The name of a second method, registered as a third-party package would register it; it fits in no time."""
-    package, found = "tests.bench.mannequin", registry._found
-    points = {
-        "method": EntryPoint("mannequin", f"{package}.method:Mannequin", registry.GROUPS["method"]),
-        "config": EntryPoint("mannequin", f"{package}.config", registry.GROUPS["config"]),
-    }
-
-    def with_mannequin(kind: str) -> dict[str, EntryPoint]:
-        return found(kind) | ({"mannequin": points[kind]} if kind in points else {})
-
-    monkeypatch.setattr(registry, "_found", with_mannequin)
+    """The name of a second method, registered as its package registers it; it fits in no time."""
+    monkeypatch.syspath_prepend(OWN_METHOD)
+    registered, point = registry._found, EntryPoint("mannequin", "own_method.spec:SPEC", registry.GROUPS["method"])
+    monkeypatch.setattr(
+        registry, "_found", lambda kind: registered(kind) | ({"mannequin": point} if kind == "method" else {})
+    )
     return "mannequin"
+
+
+@pytest.fixture
+def broken_mannequin(mannequin: str, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The same, failing with seed 0."""
+    from own_method.method import Mannequin  # pyright: ignore[reportMissingImports]
+
+    whole = Mannequin.fit
+
+    def fit(self: object, *training: object, seed: int, **more: object) -> object:
+        if seed == 0:
+            raise RuntimeError("a leg fell off\nand rolled away")
+        return whole(self, *training, seed=seed, **more)
+
+    monkeypatch.setattr(Mannequin, "fit", fit)
+    return mannequin
 
 
 def contents(folder: Path) -> dict[str, bytes]:

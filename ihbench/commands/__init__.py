@@ -16,4 +16,5 @@ COMMANDS = {
     "export": "an avatar's Gaussians as a splat PLY",
     "stress": "stiff and extreme cases with known answers, case by case",
     "kernels": "error against milliseconds for the bench's own kernels",
+    "train-mini": "train the small diffusion backbone on procedural people; goes on where it stopped",
 }

@@ -18,6 +18,7 @@ from ihbench.commands.options.keep import check_keep
 from ihbench.commands.options.parse import options
 from ihbench.commands.options.scene_choice import SceneChoice
 from ihbench.errors import BadInput
+from ihbench.scene.method_spec import method_spec
 
 if TYPE_CHECKING:
     from ihbench.clock.progress import Progress
@@ -123,8 +124,8 @@ def profile_of(chosen: AblateOptions) -> Any:
 
 
 def _ladders(method: str) -> dict[str, Ladder]:
-    registry.entry_point("method", method)
-    return registry.load("ladder", method) if method in registry.names("ladder") else {}
+    spec = method_spec(method)
+    return spec.load(spec.ablations) if spec.ablations else {}
 
 
 def _ladder(chosen: AblateOptions, vary: Mapping[str, Sequence[Any]], switches: Mapping[str, Any]) -> Ladder:
@@ -194,7 +195,7 @@ def _cells(chosen: AblateOptions, ladder: Ladder, progress: Any) -> list[tuple[s
 
     config = profile_of(chosen)
     check_keep(chosen.keep, config)
-    shared = getattr(registry.load("config", chosen.method), "SHARED_STATES", {}) if chosen.share else {}
+    shared = method_spec(chosen.method).shared_states if chosen.share else {}
     cells: list[tuple[str, Cell]] = []
     sources: list[DataSource] = []
     for protocol in chosen.apply(load_protocol(chosen.protocol, chosen.profile)):

@@ -1,4 +1,4 @@
-"""`ihbench list`: what is registered, one line each. Imports none of it."""
+"""`ihbench list`: what is registered, one line each. Imports little of it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ihbench import registry
 from ihbench.commands import COMMANDS
 from ihbench.commands.options.parse import options
 from ihbench.errors import BadInput
-from ihbench.files.regular import read_toml
+from ihbench.scene.method_spec import method_spec, usable_specs
 from ihbench.scene.protocol import load_protocol
 
 KINDS = ("methods", "datasets", "protocols", "reports", "metrics")
@@ -47,13 +47,7 @@ def main(argv: list[str]) -> int:
 
 
 def _methods() -> dict[str, str]:
-    return _each("method", lambda name: (name, _summary(name)))
-
-
-def _summary(name: str) -> str:
-    card = registry.package_folder("method", name) / "card.toml"
-    words = read_toml(card, "the method's card") if card.is_file() else {}
-    return str(words.get("summary", words.get("title", "")))
+    return _each("method", lambda name: (name, method_spec(name).summary))
 
 
 def _datasets() -> dict[str, str]:
@@ -86,7 +80,7 @@ def _clashes() -> dict[str, dict[str, str]]:
     """Names of any kind that several packages claim."""
     told = {f"{kind} {name}": why for kind in registry.GROUPS for name, why in registry.clashes(kind).items()}
     hidden = "is registered by another package; the bench's own is the one that runs"
-    told |= {f"command {name}": hidden for name in registry.names("command") if name in COMMANDS}
+    told |= {f"command {name}": hidden for spec in usable_specs() for name in spec.commands if name in COMMANDS}
     return {"clashes": told} if told else {}
 
 

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from ihbench import registry
 from ihbench.commands.options.parse import options
 from ihbench.commands.options.scene_choice import SceneChoice
 from ihbench.errors import BadInput
@@ -36,10 +35,10 @@ def _planned(chosen: SceneChoice, protocol: Protocol) -> dict[str, Any]:
     from ihbench.record.source_digest import code_of
     from ihbench.runner.run_loop import configuration
     from ihbench.scene.data_source import locate, open_capture
+    from ihbench.scene.method_spec import method_spec
     from ihbench.scene.plan import absent_regions, measure_scene
 
     config = configuration(chosen.method, chosen.profile, {})
-    leave_out = registry.load("config", chosen.method).leave_out
     source = locate(protocol, chosen.data, chosen.scene)
     code = code_of(protocol, chosen.method)
     earlier = earlier_runs(chosen.runs, chosen.method, protocol.name, chosen.profile, cpu_model(), code)
@@ -70,7 +69,8 @@ def _planned(chosen: SceneChoice, protocol: Protocol) -> dict[str, Any]:
             report["scenes"][scene] = {"note": f"the run makes the rest of this stand-in; measured then: {error}"}
             continue
         stages = {} if earlier is None else earlier.stages
-        omissions = leave_out(config, measure) + absent_regions(measure, protocol.metrics.regions)
+        needless = method_spec(chosen.method).omissions(config, measure)
+        omissions = needless + absent_regions(measure, protocol.metrics.regions)
         report["scenes"][scene] = {
             "measure": asdict(measure),
             "left_out": [asdict(o) | {"seconds": o.seconds(stages)} for o in omissions],

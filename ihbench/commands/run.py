@@ -17,6 +17,7 @@ from ihbench.commands.options.parse import options
 from ihbench.commands.options.scene_choice import SceneChoice
 from ihbench.commands.report import headline
 from ihbench.errors import BadInput
+from ihbench.scene.method_spec import method_spec
 
 if TYPE_CHECKING:
     from ihbench.record.results import RunResult
@@ -79,11 +80,7 @@ def _peek(argv: list[str], flag: str, default: str) -> str:
 
 def _with_switches(method: str, profile: str) -> type[RunOptions]:
     """`RunOptions` plus the method's own configuration as `--method.*` flags."""
-    registry.entry_point("method", method)
-    profiles = registry.load("config", method).PROFILES
-    if profile not in profiles:
-        raise BadInput(f"method {method!r}: unknown profile {profile!r}: {registry.nearest(profile, list(profiles))}")
-    config = profiles[profile]
+    config = method_spec(method).profile(profile)
     switches = Annotated[type(config), tyro.conf.arg(name="method")]
     return make_dataclass(
         "RunOptions", [("config", switches, field(default=config))], bases=(RunOptions,), frozen=True, kw_only=True

@@ -12,7 +12,6 @@ from ihbench.commands.options.device import check_device
 from ihbench.diffusion.mini.training import MiniTraining
 from ihbench.errors import BadInput
 
-SUMMARY = "train the small diffusion backbone on procedural people; goes on where it stopped"
 TRAINING = "training"  # folder in the output: state and loss curve
 
 

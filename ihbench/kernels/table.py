@@ -1,7 +1,7 @@
 """Work-precision of the bench's own kernels: milliseconds and error against the slow twin, for every back end.
 
-Behind `ihbench kernels`. A kernel is an entry of `KERNELS`, or one that a method registers under `ihbench.kernels`: a
-function from the number of repetitions to table rows.
+Behind `ihbench kernels`. A kernel is an entry of `KERNELS`, or one that a method's spec names: a function from the
+number of repetitions to table rows.
 """
 
 from __future__ import annotations
@@ -11,16 +11,17 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from ihbench import registry
 from ihbench.clock import machine, streams
 from ihbench.errors import BadInput
 from ihbench.kernels.measuring import UNSTABLE, Row
 from ihbench.kernels.metrics import flip_rows, frame_rows, lpips_rows, ssim_rows
 from ihbench.kernels.position_maps import position_map_rows
+from ihbench.kernels.sampler import sampler_rows
 from ihbench.kernels.scoring import score_rows
 from ihbench.kernels.skinning import lbs_rows
 from ihbench.kernels.splats import WINDOW, splat_rows
 from ihbench.kernels.zbuffers import zbuffer_rows
+from ihbench.scene.method_spec import usable_specs
 
 REPEATS = 15
 TABLE_WIDTH = 118  # characters; a narrower terminal would cut the numbers
@@ -39,7 +40,8 @@ def run_kernels(
 
     Raises BadInput for an unknown name, fewer than one repetition, or a folder that cannot be written.
     """
-    known = [*KERNELS, *(name for name in registry.names("kernel") if name not in KERNELS)]
+    of_methods = {name: (spec, kernel) for spec in usable_specs() for name, kernel in spec.kernels.items()}
+    known = dict.fromkeys([*KERNELS, *of_methods])
     unknown = sorted(set(names or ()) - set(known))
     if unknown:
         raise BadInput(f"kernel {unknown[0]!r}: expected one of {', '.join(sorted(known))}")
@@ -47,7 +49,7 @@ def run_kernels(
         raise BadInput(f"kernel repetitions: expected at least 1, got {repeats}")
     rows = []
     for name in names or known:
-        rows += (KERNELS[name] if name in KERNELS else registry.load("kernel", name))(repeats)
+        rows += (KERNELS[name] if name in KERNELS else of_methods[name][0].load(of_methods[name][1]))(repeats)
     first: dict[tuple[str, str], float] = {}
     for row in rows:
         row["ratio"] = row["forward_ms"] / first.setdefault((row["kernel"], row["case"]), row["forward_ms"])
@@ -74,6 +76,7 @@ KERNELS: dict[str, Callable[[int], list[Row]]] = {
     "position-map": position_map_rows,
     "frame": frame_rows,
     "score": score_rows,
+    "sampler": sampler_rows,
 }
 
 

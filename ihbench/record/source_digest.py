@@ -40,7 +40,7 @@ NOT_IN_NUMBERS = (
     "clock/machine.py", "record/provenance.py", "clock/threads.py",
     "metrics/oracles/*",
 )  # fmt: skip
-DESCRIPTIONS = ("*.md", "*.rst", "*.typed", "*~", ".*", "card.toml")
+DESCRIPTIONS = ("*.md", "*.rst", "*.typed", "*~", ".*")
 ROOM_NAME = re.compile(rb"ihbench\.(methods|datasets|protocols)\.(\w+)")
 LARGE = 64 * 2**20  # bytes; of larger files, which are weights, only the ends are read
 ENDS = 2**16  # bytes
@@ -51,7 +51,7 @@ _known: dict[str, tuple[tuple[int, int, int], bytes]] = {}  # path -> state of t
 
 def code_of(protocol: Protocol, method: str) -> str:
     """What a run's identity says of its code: version, hash of the method's package, hash of the bench."""
-    own = _digest_of([("method", method), ("config", method)])
+    own = _digest_of([("method", method)])
     return f"{__version__}+{own}+{bench_code(protocol)}"
 
 

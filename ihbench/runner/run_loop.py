@@ -33,8 +33,9 @@ from ihbench.record.store import RunFolder, RunIdentity, is_finished
 from ihbench.runner.recorded_run import RecordedRun, about_scene, recorded
 from ihbench.runner.score_stage import ScoreStage
 from ihbench.scene.capture_digest import capture_digest
-from ihbench.scene.contracts import Avatar, Capture, Method, TestView, TrainingSet
+from ihbench.scene.contracts import Avatar, Capture, TestView, TrainingSet
 from ihbench.scene.data_source import DataSource
+from ihbench.scene.method_spec import method_spec
 from ihbench.scene.plan import Omission, SceneMeasure, absent_regions, measure_scene
 from ihbench.scene.protocol import Protocol
 from ihbench.scene.views import OccludedScene, open_scene
@@ -69,11 +70,7 @@ class RunRequest:
 
 def configuration(method: str, profile: str, switches: dict[str, Any]) -> Any:
     """A method's configuration under a profile, with some fields replaced. Raises `BadInput` for unknown fields."""
-    registry.entry_point("method", method)
-    profiles = registry.load("config", method).PROFILES
-    if profile not in profiles:
-        raise BadInput(f"method {method!r}: unknown profile {profile!r}: {registry.nearest(profile, list(profiles))}")
-    config = profiles[profile]
+    config = method_spec(method).profile(profile)
     known = [*flat(config), *(field.name for field in fields(config))]
     for name in switches:
         if name not in known:
@@ -140,9 +137,8 @@ def load_avatar(folder: Path, data: Path | None, body: Path | None) -> tuple[Any
     if not (folder / "avatar").is_dir():
         raise BadInput(f"{folder}: has no avatar (status {record['status']}); finish the run first")
     identity, model = record["identity"], reopen_body(folder, data, body)
-    method: Method = registry.load("method", identity["method"])(
-        configuration(identity["method"], identity["profile"], {})
-    )
+    spec = method_spec(identity["method"])
+    method = spec.create(spec.profile(identity["profile"]))
     return method.load(folder / "avatar", model), lambda: reopen_capture(folder, data, body)
 
 
@@ -175,7 +171,7 @@ class _Run(RecordedRun):
                 config, left_out, withheld = _planned(request, measure)
                 hidden_share = scene.hiding.hidden_share()
             with self.ledger.stage("compile"):
-                method: Method = registry.load("method", request.method)(config)
+                method = method_spec(request.method).create(config)
                 machine.warm_up(request.device)
                 warm_up(request.device)
             with self.ledger.stage("load"):
@@ -211,8 +207,7 @@ class _Run(RecordedRun):
         seconds count as this run's own: the clock is saved with a state."""
         from ihbench.runner.shared_states import lend, lender
 
-        states = getattr(registry.load("config", self.request.method), "SHARED_STATES", {})
-        for state, free in states.items():
+        for state, free in method_spec(self.request.method).shared_states.items():
             other = lender(self.request.runs, self.folder, state, free, machine.identity())
             if other is not None:
                 self.ledger.events.extend(lend(other, self.folder, state))  # that it went back, say
@@ -240,9 +235,9 @@ class _Run(RecordedRun):
 def _planned(request: RunRequest, measure: SceneMeasure) -> tuple[Any, list[Omission], list[str]]:
     """The configuration without what the scene does not need, what that was, and fields that `keep` held back. A
     switch that differs from the profile was set by somebody, and stays."""
-    found = registry.load("config", request.method)
-    own, base = flat(request.config), flat(found.PROFILES[request.protocol.profile])
-    proposed = [o for o in found.leave_out(request.config, measure) if own[o.field] == base[o.field]]
+    spec = method_spec(request.method)
+    own, base = flat(request.config), flat(spec.profile(request.protocol.profile))
+    proposed = [o for o in spec.omissions(request.config, measure) if own[o.field] == base[o.field]]
     withheld = [o.field for o in proposed if "all" in request.keep or o.field in request.keep]
     taken = [o for o in proposed if o.field not in withheld]
     config = with_fields(request.config, {o.field: o.value for o in taken})
@@ -252,16 +247,15 @@ def _planned(request: RunRequest, measure: SceneMeasure) -> tuple[Any, list[Omis
 def _changed(request: RunRequest, withheld: list[str]) -> list[str]:
     """What sets the run apart from the profile, for table rows: switches, and what the plan was not let to leave out
     (a `keep` that changed nothing is no difference)."""
-    base = flat(registry.load("config", request.method).PROFILES[request.protocol.profile])
+    base = flat(method_spec(request.method).profile(request.protocol.profile))
     changed = [f"{name}={value}" for name, value in flat(request.config).items() if value != base[name]]
     return [*changed, f"keep={','.join(withheld)}"] if withheld else changed
 
 
 def _outside(request: RunRequest) -> dict[str, str]:
     """A hash of files outside the package that the configuration names, such as weights: same path, other content is
-    another run. A method's config module lists them as `outside_files(config)`; it may have none."""
-    named = getattr(registry.load("config", request.method), "outside_files", None)
-    found = [] if named is None else named(request.config)
+    another run. See `MethodSpec.outside_files`."""
+    found = method_spec(request.method).outside(request.config)
     if not found:
         return {}
     digest = hashlib.sha256()

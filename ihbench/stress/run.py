@@ -11,6 +11,7 @@ from importlib import import_module
 from ihbench import registry
 from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput
+from ihbench.scene.method_spec import usable_specs
 from ihbench.stress.case import Case, Outcome, Verdict, error_of
 
 GROUPS = ("metrics", "geometry", "splat", "data", "training", "ranking")  # a module each, with a list CASES
@@ -19,8 +20,8 @@ GROUPS = ("metrics", "geometry", "splat", "data", "training", "ranking")  # a mo
 def all_cases() -> list[Case]:
     """Every case, group by group: the bench's own, then those of registered methods."""
     cases = [case for group in GROUPS for case in import_module(f"ihbench.stress.{group}").CASES]
-    for name in registry.names("stress cases"):
-        cases += registry.load("stress cases", name).CASES
+    for spec in usable_specs():
+        cases += spec.load(spec.stress) if spec.stress else []
     return sorted(cases, key=lambda case: GROUPS.index(case.group) if case.group in GROUPS else len(GROUPS))
 
 

@@ -141,8 +141,6 @@ PAPER = InpaintHumanConfig(
 
 PROFILES = {"quick": QUICK, "paper": PAPER}
 
-SHARED_STATES = {"stage1": ("inpaint.", "refine.")}  # saved state -> beginnings of the fields it does not depend on
-
 
 def leave_out(config: InpaintHumanConfig, scene: SceneMeasure) -> list[Omission]:
     """What this scene does not need of this configuration (see `ihbench.scene.plan`)."""

@@ -88,29 +88,37 @@ def test_the_traceback_is_printed_when_asked_for(monkeypatch, bench, capsys):
 OTHERS = {
     "raises": "raise OSError('no such library\\n at all')",
     "exits": "raise SystemExit(4)",
-    "not_whole": "SUMMARY = 'a command'",
-    "fails": "SUMMARY = 'a command'\ndef main(argv): return [][1]",
-    "leaves": "SUMMARY = 'a command'\ndef main(argv): raise SystemExit('not today')",
+    "not_whole": "",
+    "fails": "def main(argv): return [][1]",
+    "leaves": "def main(argv): raise SystemExit('not today')",
 }
+SPEC = """from ihbench.scene.method_spec import Command, MethodSpec
+commands = {"NAME": Command("a command", "others_NAME.command:main")}
+SPEC = MethodSpec(name="others", title="", summary="", method="ihbench.x:X", profiles={}, commands=commands)
+"""
 
 
 @pytest.mark.parametrize(
     ("name", "status", "words"),
     [
-        ("raises", 2, "command 'raises' cannot be loaded: OSError('no such library\\n at all')"),
-        ("exits", 2, "command 'exits' cannot be loaded: SystemExit(4)"),
-        ("not_whole", 2, "command 'not_whole' cannot be used: others_not_whole has no main"),
+        ("raises", 2, "others_raises.command:main cannot be loaded: OSError('no such library\\n at all')"),
+        ("exits", 2, "others_exits.command:main cannot be loaded: SystemExit(4)"),
+        ("not_whole", 2, "others_not_whole.command:main cannot be loaded: AttributeError"),
         ("fails", 3, "a fault of the package others_fails, not of yours: IndexError"),
         ("leaves", 2, "not today"),
     ],
 )
 def test_commands_of_other_packages_that_misbehave(name, status, words, bench, monkeypatch, tmp_path):
-    (tmp_path / f"others_{name}.py").write_text(OTHERS[name])
+    (tmp_path / f"others_{name}").mkdir()
+    (tmp_path / f"others_{name}" / "command.py").write_text(OTHERS[name])
+    (tmp_path / f"others_{name}" / "spec.py").write_text(SPEC.replace("NAME", name))
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     found = registry._found
-    point = EntryPoint(name, f"others_{name}", registry.GROUPS["command"])
-    monkeypatch.setattr(registry, "_found", lambda kind: found(kind) | ({name: point} if kind == "command" else {}))
+    point = EntryPoint("others", f"others_{name}.spec:SPEC", registry.GROUPS["method"])
+    monkeypatch.setattr(
+        registry, "_found", lambda kind: found(kind) | ({"others": point} if kind == "method" else {})
+    )
     outcome = bench(name)
     assert (outcome.status, len(outcome.err.splitlines())) == (status, 1)
     assert words in outcome.err

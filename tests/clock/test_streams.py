@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import io
 import sys
+from types import SimpleNamespace
 
 import pytest
 
-from ihbench import registry
 from ihbench.cli import main
 from ihbench.clock import streams
+from ihbench.scene.method_spec import Command
 
 NASTY = "a\x1b[2J\x1b[31mb\x9b\u202ec\U000e0041"
 
@@ -20,19 +21,15 @@ class Terminal(io.StringIO):
 
 
 def showing(monkeypatch, name):
-    class Command:
-        SUMMARY = name
+    def command(argv):
+        print(name)
+        print(f"\t{name}", file=sys.stderr)
+        with streams.styled():
+            print("\x1b[1mbold\x1b[0m\x1b[2J")
+        return 0
 
-        @staticmethod
-        def main(argv):
-            print(name)
-            print(f"\t{name}", file=sys.stderr)
-            with streams.styled():
-                print("\x1b[1mbold\x1b[0m\x1b[2J")
-            return 0
-
-    monkeypatch.setattr(registry, "names", lambda kind: ["nasty"])
-    monkeypatch.setattr(registry, "load", lambda kind, name: Command)
+    spec = SimpleNamespace(commands={"nasty": Command(name, "theirs:main")}, load=lambda part: command)
+    monkeypatch.setattr("ihbench.cli.usable_specs", lambda: [spec])
 
 
 @pytest.mark.parametrize("stream", [io.StringIO, Terminal])

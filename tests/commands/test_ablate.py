@@ -11,7 +11,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ihbench import registry
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.commands import ablate as ablate_command
@@ -20,6 +19,9 @@ from ihbench.config_fields import flat
 from ihbench.errors import BadInput
 from ihbench.files.atomic import read_json
 from ihbench.methods.inpainthuman.config import LEAST_TEXELS, PROFILES, QUICK
+from ihbench.methods.inpainthuman.method import InpaintHuman
+from ihbench.methods.inpainthuman.spec import SPEC, STAGE1
+from ihbench.methods.inpainthuman.studies.ladders import LADDERS
 from ihbench.record.results import read_result
 from ihbench.record.store import RunFolder
 from ihbench.runner import executor as cells_module
@@ -79,10 +81,10 @@ def test_what_is_compared_is_kept_from_the_plan():
     """A rung has what it says, also where it says what the profile has anyway."""
     ladder = grid(QUICK, {"texels": [QUICK.texels, 2 * QUICK.texels], "inpaint.on": [True]})
     assert [kept(ladder, rung, QUICK) for rung in ladder.rungs] == [("inpaint.on", "texels"), ("inpaint.on",)]
-    ladder = registry.load("ladder", "inpainthuman")["table2"]
+    ladder = LADDERS["table2"]
     full = ladder.rungs[-1]
     assert set(kept(ladder, full, QUICK)) == {"levels", "one_fit", "inpaint.on", "inpaint.ti", "inpaint.sg"}
-    plan = registry.load("ladder", "inpainthuman")["plan"]
+    plan = LADDERS["plan"]
     assert [kept(plan, rung, QUICK) for rung in plan.rungs] == [("all",), ()]
 
 
@@ -112,18 +114,18 @@ def test_what_is_set_on_all_does_not_overrule_a_rung():
     assert {configured(rung, QUICK).texels for rung in ladder.rungs} == {32}
 
 
-@pytest.mark.parametrize("name", registry.load("ladder", "inpainthuman"))
+@pytest.mark.parametrize("name", LADDERS)
 @pytest.mark.parametrize("profile", PROFILES)
 def test_every_rung_of_the_method_is_a_configuration_of_its_own(name, profile):
-    ladder = registry.load("ladder", "inpainthuman")[name]
+    ladder = LADDERS[name]
     found = [configured(rung, PROFILES[profile]) for rung in ladder.rungs]
     keys = {(tuple(flat(config).items()), rung.keep) for config, rung in zip(found, ladder.rungs, strict=True)}
     assert len(keys) == len(found)
 
 
 def test_the_papers_rungs_share_their_first_stage_by_the_maps_they_have():
-    ladder = registry.load("ladder", "inpainthuman")["table2"]
-    free = registry.load("config", "inpainthuman").SHARED_STATES["stage1"]
+    ladder = LADDERS["table2"]
+    free = SPEC.shared_states[STAGE1]
     keys = {rung.name: shared_part(configured(rung, QUICK), free) for rung in ladder.rungs}
     assert len(set(keys.values())) == 3  # the one fit is another stage 1
     assert keys["one level"] == keys["one level, diffusion"] != keys["MS"] == keys["MS + TI + SG"]
@@ -166,23 +168,21 @@ def the_table_holds_the_means_of_its_runs(bench, outcome, out):
 
 def what_is_finished_is_not_done_again(bench, words, before, monkeypatch):
     with monkeypatch.context() as planted:
-        method = registry.load("method", "inpainthuman")
-        planted.setattr(method, "fit", lambda *_, **__: pytest.fail("fitted again"))
+        planted.setattr(InpaintHuman, "fit", lambda *_, **__: pytest.fail("fitted again"))
         again = ablate(bench, *words)
     assert again.status == 0
     assert again.out == before.out
 
 
 def a_failed_cell_does_not_take_the_others_along(bench, monkeypatch):
-    method = registry.load("method", "inpainthuman")
-    honest = method.fit
+    honest = InpaintHuman.fit
 
     def fit(self, training, **more):
         if training.name == SCENES[0]:
             raise RuntimeError("a planted fault")
         return honest(self, training, **more)
 
-    monkeypatch.setattr(method, "fit", fit)
+    monkeypatch.setattr(InpaintHuman, "fit", fit)
     outcome = ablate(bench, "--vary", "steps=2:3", "--seed", "0", "--scene", *SCENES)
     assert outcome.status == 1
     assert "| steps=3 | 1 | 1 of 2 |" in outcome.out
@@ -207,7 +207,7 @@ def test_a_scene_that_cannot_be_opened_does_not_take_the_others_along(bench, mon
 
 def test_a_rung_can_keep_what_the_plan_would_leave_out(bench):
     """And shares nothing with one that does not keep it."""
-    ladder = registry.load("ladder", "inpainthuman")["plan"]
+    ladder = LADDERS["plan"]
     chosen = AblateOptions(protocol=str(bench.protocol), scene=(SCENES[0],), seed=(0, 1), runs=bench.runs)
     with bench.in_its_world():
         cells = ablate_command._cells(chosen, ladder, Progress.silent())

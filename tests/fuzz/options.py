@@ -29,6 +29,7 @@ from ihbench import registry
 from ihbench.cli import COMMANDS, main
 from ihbench.datasets.plain import plain_scene
 from ihbench.errors import BadInput
+from ihbench.scene.method_spec import usable_specs
 from ihbench.stress.drawn_capture import a_camera, a_pose, the_body
 from tests.fuzz.patience import TooLong, at_most
 from tests.fuzz.records import make_run
@@ -75,7 +76,7 @@ class Option:
 
 def commands() -> list[tuple[str, ...]]:
     """Every command and registered verb, as it is called."""
-    found = [(name,) for name in (*COMMANDS, *registry.names("command"))]
+    found = [(name,) for name in (*COMMANDS, *(name for spec in usable_specs() for name in spec.commands))]
     return found + [("report", verb) for verb in registry.names("report verb")]
 
 

@@ -66,7 +66,7 @@ OF_NO_NUMBER = [
         "ihbench/record/row_labels.py",
         "protocols/zju_occ.toml",
     ),
-    *("methods/inpainthuman/card.toml", "methods/inpainthuman/METHOD.md"),
+    "methods/inpainthuman/METHOD.md",
 ]
 
 
@@ -223,7 +223,7 @@ def test_linked_folders_count_and_circles_end(tmp_path):
     assert tree_digest(root) != before
 
 
-@pytest.mark.parametrize("kind", ["method", "config", "dataset", "occlusion", "metric preset"])
+@pytest.mark.parametrize("kind", ["method", "dataset", "occlusion", "metric preset"])
 @pytest.mark.parametrize("shape", ["package", "module", "namespace"])
 def test_the_source_of_another_distribution_counts(tmp_path, monkeypatch, kind, shape):
     name = f"theirs_{shape}_{kind.replace(' ', '_')}"
@@ -242,8 +242,6 @@ def test_the_source_of_another_distribution_counts(tmp_path, monkeypatch, kind, 
     found = registry._found
     point = EntryPoint("theirs", f"{module}:Thing", registry.GROUPS[kind])
     known = {other: found(other) | ({"theirs": point} if other == kind else {}) for other in registry.GROUPS}
-    if kind in ("method", "config"):
-        known = {k: v | {"theirs": point} if k in ("method", "config") else v for k, v in known.items()}
     monkeypatch.setattr(registry, "_found", known.get)
     where = registry.source(kind, "theirs")
     assert beside == where or where in beside.parents
@@ -260,10 +258,8 @@ def test_a_method_of_others_that_is_built_on_ours_counts_ours(checkout, tmp_path
     (package / "__init__.py").write_text("")
     (package / "method.py").write_text("from ihbench.methods.inpainthuman.method import InpaintHuman")
     found, source = registry._found, registry.source
-    points = {
-        kind: EntryPoint("theirs", "theirs_on_ours.method:M", registry.GROUPS[kind]) for kind in ("method", "config")
-    }
-    monkeypatch.setattr(registry, "_found", lambda k: found(k) | ({"theirs": points[k]} if k in points else {}))
+    point = EntryPoint("theirs", "theirs_on_ours.spec:SPEC", registry.GROUPS["method"])
+    monkeypatch.setattr(registry, "_found", lambda k: found(k) | ({"theirs": point} if k == "method" else {}))
     monkeypatch.setattr(registry, "source", lambda kind, name: package if name == "theirs" else source(kind, name))
     before = code_of(load_protocol("zju_occ"), "theirs")
     stage = checkout / "methods" / "inpainthuman" / "stages" / "stage1.py"

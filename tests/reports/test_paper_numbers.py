@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import tomllib
 
 import pytest
 
-from ihbench import registry
 from ihbench.errors import BadInput
+from ihbench.methods.inpainthuman.studies.ladders import LADDERS
 from ihbench.reports.paper.paper_numbers import Digits, paper_table
+from ihbench.scene.method_spec import method_spec
 
 
 def row(table, name):
@@ -56,13 +56,11 @@ def test_statuses_say_who_reports_what():
 
 
 def test_numbers_that_are_written_elsewhere_too_are_the_same():
-    card = tomllib.loads(
-        (registry.package_folder("method", "inpainthuman") / "card.toml").read_text(encoding="utf-8")
-    )
     own = [cell.value for cell in row(paper_table("table1"), "InpaintHuman").cells]
-    assert [*card["reported"]["zju_mocap"].values(), *card["reported"]["ocmotion"].values()] == own
+    reported = method_spec("inpainthuman").paper.reported
+    assert [*reported["zju_mocap"].values(), *reported["ocmotion"].values()] == own
     rows = [[cell.value for cell in row.cells] for row in paper_table("table2").rows]
-    rungs = [rung.paper for rung in registry.load("ladder", "inpainthuman")["table2"].rungs if rung.paper]
+    rungs = [rung.paper for rung in LADDERS["table2"].rungs if rung.paper]
     assert rungs
     assert all([paper["psnr"], paper["ssim"], paper["lpips"]] in rows for paper in rungs)
 

@@ -8,11 +8,11 @@ import pytest
 from PIL import Image
 
 import ihbench
-from ihbench import registry
 from ihbench.clock.progress import Progress
 from ihbench.files import atomic
 from ihbench.files.atomic import read_json, read_json_lines
 from ihbench.methods.inpainthuman.config import QUICK
+from ihbench.methods.inpainthuman.method import InpaintHuman
 from ihbench.metrics import psnr
 from ihbench.record.results import read_result
 from ihbench.scene.contracts import MaskState
@@ -49,7 +49,7 @@ def no_fit(monkeypatch):
     def fit(*_, **__):
         raise AssertionError("fitted again")
 
-    monkeypatch.setattr(registry.load("method", "inpainthuman"), "fit", fit)
+    monkeypatch.setattr(InpaintHuman, "fit", fit)
 
 
 # ------------------------------------------------------------------------------------------ what is left behind
@@ -165,9 +165,8 @@ def test_a_notebook_finds_the_run_of_the_command_line(bench_with_run, finished):
 
 def test_force_repeats_the_run_bit_for_bit(bench_with_run, finished, monkeypatch):
     fitted = []
-    method = registry.load("method", "inpainthuman")
-    fit = method.fit
-    monkeypatch.setattr(method, "fit", lambda self, *a, **k: fitted.append(1) or fit(self, *a, **k))
+    fit = InpaintHuman.fit
+    monkeypatch.setattr(InpaintHuman, "fit", lambda self, *a, **k: fitted.append(1) or fit(self, *a, **k))
     assert bench_with_run.run("--force").status == 0
     (folder,) = bench_with_run.folders()
     assert fitted

@@ -11,11 +11,11 @@ from importlib import import_module
 import numpy as np
 import pytest
 
-from ihbench import registry
 from ihbench.cli import main
 from ihbench.clock.ledger import Ledger
 from ihbench.errors import BadInput, Diverged
 from ihbench.metrics import ssim as ssim_function
+from ihbench.scene.method_spec import usable_specs
 from ihbench.stress import run
 from ihbench.stress.case import Answer, Case, error_of, words_of
 from ihbench.stress.ranking import flips
@@ -50,7 +50,7 @@ def test_the_set_is_large_named_versioned_and_reasoned(cases):
 
 
 def test_a_method_brings_its_own_cases(cases):
-    own = [case for name in registry.names("stress cases") for case in registry.load("stress cases", name).CASES]
+    own = [case for spec in usable_specs() for case in spec.load(spec.stress)]
     assert {case.name for case in own} <= set(cases)
     assert {f"inpainthuman-rate-{factor}" for factor in (0.1, 1, 10, 100)} <= {case.name for case in own}
 

@@ -13,13 +13,13 @@ from ihbench.clock.ledger import Ledger
 from ihbench.fit.dissimilarity import dissimilarity, where_known
 from ihbench.methods.inpainthuman.avatar.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.config import ONE_FIT_SSIM
+from ihbench.methods.inpainthuman.spec import STAGE1
 from ihbench.methods.inpainthuman.stages.optimisation import Optimisation
 from ihbench.render.splat import render_gaussians
 from ihbench.scene.contracts import MaskState, TrainingSet, TrainView
 from ihbench.scene.views import LazyViews
 
 MARGIN = 0.15  # of the projected body's box on every side: garments and pose errors stay inside the window
-STATE = "stage1"
 TARGETS_HELD = 256  # prepared views kept in memory, about 2 MB each in the paper profile
 
 
@@ -132,7 +132,7 @@ def loss_of(avatar: GaussianAvatar, target: Target, background: tuple[float, flo
 class Stage1(Optimisation):
     """The optimisation, step by step, with everything needed to stop after any step and go on later."""
 
-    name, title = STATE, "stage 1"
+    name, title = STAGE1, "stage 1"
 
     def __init__(self, avatar: GaussianAvatar, training: TrainingSet, seed: int, ledger: Ledger):
         views = training.views

@@ -78,7 +78,7 @@ class Stage3(Optimisation):
             ledger,
             steps=chosen.steps,
             views=n + len(self._others),
-            first_step=avatar.config.steps,
+            first_step=avatar.config.fit_steps,
             lr_share=chosen.lr_share,
             warm_up=chosen.warm_up,
             maps_only=not chosen.networks,

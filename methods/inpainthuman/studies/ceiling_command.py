@@ -14,11 +14,11 @@ import tyro
 from ihbench.bounds import Within
 from ihbench.commands.options.device import check_device
 from ihbench.errors import BadInput
+from ihbench.methods.inpainthuman.spec import SPEC
 
 if TYPE_CHECKING:
     from ihbench.methods.inpainthuman.studies.ceiling import CeilingRow
 
-SUMMARY = "what InpaintHuman's runs would have reached with a better painter, up to one that knows the truth"
 REGIONS = ("hidden", "visible", "never_seen")
 
 
@@ -43,7 +43,7 @@ class CeilingOptions:
 def main(argv: list[str]) -> int:
     from ihbench.commands.options.parse import options
 
-    return _ceiling(options(CeilingOptions, argv, "ceiling", f"Measure {SUMMARY}."))
+    return _ceiling(options(CeilingOptions, argv, "ceiling", f"Measure {SPEC.commands['ceiling'].summary}."))
 
 
 def _ceiling(chosen: CeilingOptions) -> int:

@@ -17,8 +17,6 @@ from ihbench.diffusion.inpaint_config import InpaintConfig
 from ihbench.errors import BadInput
 from ihbench.methods.inpainthuman.studies.paint_rows import ROWS
 
-SUMMARY = "how well InpaintHuman's painters fill hidden pixels, against the truth behind the occluder"
-
 
 @dataclass(frozen=True, kw_only=True)
 class PaintOptions(ProtocolChanges):

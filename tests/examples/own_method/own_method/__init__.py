@@ -1,1 +1,1 @@
-"""A method as somebody else might register it: the body mesh in one colour. For tests of the bench only."""
+"""A method in a package of its own: the body mesh in one grey."""

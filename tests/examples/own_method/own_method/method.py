@@ -2,43 +2,40 @@
 
 import json
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from ihbench.body import Body
 from ihbench.render.zbuffer import rasterize
+from own_method.spec import MannequinConfig
 
 
 class Mannequin:
-    def __init__(self, config):
+    def __init__(self, config: MannequinConfig):
         self.config = config
 
     def fit(self, training, *, device, seed, ledger, progress):
-        trouble = self.config.trouble if seed == self.config.trouble_seed else "none"
-        if trouble == "raise":
-            raise RuntimeError("a leg fell off\nand rolled away")
-        avatar = MannequinAvatar(training.body, self.config.brightness + 0.01 * seed, trouble)
-        ledger.offer(1, avatar, force=True)
+        avatar = MannequinAvatar(training.body, self.config.brightness + self.config.seed_step * seed)
+        ledger.offer(1, avatar, force=True)  # a point of the quality-time curve
         return avatar
 
-    def load(self, folder, body, device="cpu"):
+    def load(self, folder: Path, body: Body, device: str = "cpu"):
         return MannequinAvatar(body, json.loads((folder / "grey.json").read_text()))
 
 
 @dataclass(frozen=True)
 class MannequinAvatar:
-    body: object
+    body: Body
     grey: float
-    trouble: str = "none"
 
-    def render(self, camera, body_pose, background=(1.0, 1.0, 1.0)):
-        if self.trouble == "wrong-size":
-            camera = camera.scaled(camera.width // 2, camera.height // 2)
+    def render(self, camera, body_pose, background=(1.0, 1.0, 1.0), frame=None):
         image = np.empty((camera.height, camera.width, 3), np.float32)
         image[:] = background
         mesh = rasterize(camera.project(self.body.pose(body_pose)), self.body.faces, camera.height, camera.width).mask
-        image[mesh] = np.nan if self.trouble == "nan" else self.grey
+        image[mesh] = self.grey
         return image, mesh.astype(np.float32)
 
-    def save(self, folder):
+    def save(self, folder: Path):
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "grey.json").write_text(json.dumps(self.grey))

@@ -1,23 +1,22 @@
-"""The mannequin's switches."""
+"""What ihbench knows of the method before it imports it: its name, its switches, where its class is."""
 
 from dataclasses import dataclass
-from typing import Literal
 
-from ihbench.scene.plan import Omission
+from ihbench.scene.method_spec import MethodSpec
 
 
 @dataclass(frozen=True)
 class MannequinConfig:
     brightness: float = 0.5
-    """The mesh's grey."""
-    trouble: Literal["none", "raise", "wrong-size", "nan"] = "none"
-    """What goes wrong: fitting raises, or pictures of a wrong size or full of NaN come out."""
-    trouble_seed: int = 0
-    """The seed with which it goes wrong."""
+    """The mesh's grey, 0 to 1."""
+    seed_step: float = 0.01
+    """How much brighter it gets with every seed."""
 
 
-PROFILES = {"quick": MannequinConfig(), "paper": MannequinConfig()}
-
-
-def leave_out(config: MannequinConfig, scene: object) -> list[Omission]:
-    return []
+SPEC = MethodSpec(
+    name="mannequin",
+    title="Mannequin",
+    summary="the body mesh in one grey: nothing is learned",
+    method="own_method.method:Mannequin",
+    profiles={"quick": MannequinConfig(), "paper": MannequinConfig()},
+)
