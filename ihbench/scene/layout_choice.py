@@ -35,6 +35,8 @@ class LayoutChoice:
     def _find(self, root: Path) -> type[Dataset]:
         if not user_path(root).is_dir():
             raise BadInput(f"{root}: no such folder")
+        if len(self.layouts) == 1:  # it says itself what it lacks
+            return resolve_name(self.layouts[0])
         complaints = []
         for name in self.layouts:
             layout = resolve_name(name)
@@ -44,6 +46,4 @@ class LayoutChoice:
                 complaints.append(str(error).removeprefix(f"{root}: "))
                 continue
             return layout
-        if len(complaints) == 1:
-            raise BadInput(f"{root}: {complaints[0]}")
         raise BadInput(f"{root}: no layout of {self.name} ({'; '.join(complaints)})")

@@ -822,7 +822,7 @@ def test_the_examples_of_the_page_run(tmp_path, own_body):
             "calibration": {"main": calibration | {"dist": np.zeros((1, 5))}, "basenames": ["main"]},
         }
         known["images"] = [np.zeros((HEIGHT, WIDTH, 3), np.uint8)]
-        exec("from ihbench.datasets import plain_scene\n" + example, known)
+        exec("from ihbench.datasets.plain import plain_scene\n" + example, known)
         plain_scene.write_body_file(known["folder"], body)
         capture = PlainScene(known["folder"]).open(kind)
         known["masks"] = [255 * silhouette(body, capture.body_pose(0), capture.camera(0)).astype(np.uint8)]

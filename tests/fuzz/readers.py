@@ -33,7 +33,7 @@ from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.images import read_image
 from ihbench.files.safe_pickle import load_npy, load_pickle
-from ihbench.reports.lint.table_reading import read_tables
+from ihbench.reports.lint.table_files import read_tables
 from ihbench.reports.paper.paper_numbers import paper_table
 from ihbench.scene.protocol import read_protocol
 from tests.bench.fake_capture import a_camera, a_pose

@@ -91,10 +91,10 @@ def test_a_figure_of_the_users_stays(tmp_path):
     (tmp_path / "kernels.svg").write_text("drawn by hand")
     drawn, _ = diagram.figure()
     with pytest.raises(BadInput, match=r"kernels\.svg: is there already"):
-        diagram.save(drawn, tmp_path / "kernels", [{"a": 1}])
+        outputs.write_files(tmp_path / "kernels", diagram.files(drawn, [{"a": 1}]))
     assert (tmp_path / "kernels.svg").read_text() == "drawn by hand"
     for _ in range(2):
-        diagram.save(drawn, tmp_path / "other" / "kernels", [{"a": 1}])
+        outputs.write_files(tmp_path / "other" / "kernels", diagram.files(drawn, [{"a": 1}]))
 
 
 @pytest.mark.parametrize(
