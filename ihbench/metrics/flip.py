@@ -14,10 +14,10 @@ continued by their outermost pixel, all filters of Y, Cx and Cz reach as far as 
 and the default is a 0.7 m wide screen of 3840 px seen from 0.7 m. Two roundings of it are not followed: its
 arithmetic is float32, and white and the inverse colour matrix, nine digits there, are exact here.
 
-How it is computed. Every filter is separable or a sum of two that are; `flip_numba` runs them in float64 over a ring
-of rows. Where the images agree as far as the filters reach FLIP is exactly 0, so only what lies within their radius
-of a differing pixel is looked at. The weights of a derivative sum to 0, so it is taken of differences between pixels:
-on a flat patch it is then exactly 0, where a rounding error of 1e-17 would come out of the square root as 3e-9.
+How it is computed. Every filter is separable or a sum of two that are; OpenCV runs them in float64. Where the images
+agree as far as the filters reach FLIP is exactly 0, so only the rectangle within their radius of a differing pixel is
+looked at. The weights of a derivative sum to 0, so it is a filter of the differences between neighbours: on a flat
+patch it is then exactly 0, where a rounding error of 1e-17 would come out of the square root as 3e-9.
 
 The map equals its twin's to 1e-12 except in the outermost pixels of a difference, where filters leave 1e-13 of it and
 rounding errors are as large: there FLIP is below 1e-5, and both are wrong by up to 1e-9.
@@ -26,21 +26,20 @@ rounding errors are as large: there FLIP is below 1e-5, and both are wrong by up
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from threading import local
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench.metrics.images import Mask, as_background, bounds, checked, differing_pixels, grown, peak_of
+from ihbench.metrics.images import Mask, as_background, bounds, checked, differing_pixels, grown
 
 PPD = (
     0.7 * (3840 / 0.7) * math.pi / 180
 )  # pixels per degree: distance, pixels and width of the official tool's screen
-BAND = 2**18  # about so many pixels are worked on at a time: the float64 channels of both take 13 MB
+BAND = 2**15  # about so many pixels are worked on at a time: a float64 channel takes 0.5 MB
 
 # exponent of the colour difference, the part of the largest one that becomes KNEE, width of a feature in degrees
 COLOR_EXPONENT, KNEE_AT, KNEE, FEATURE_WIDTH = 0.7, 0.4, 0.95, 0.082
@@ -58,6 +57,8 @@ _XYZ = np.array(
 )
 TO_XYZ: NDArray[np.float64] = _XYZ / _XYZ.sum(1, keepdims=True)
 TO_RGB = np.linalg.inv(TO_XYZ).astype(np.float64)
+
+Plane = NDArray[np.float64]  # [h, w] one channel
 
 
 def flip(
@@ -94,16 +95,15 @@ def mean_flip(
 ) -> float:
     """`flip` for images already checked."""
     filters = Filters.of(ppd)
-    pixels = differs.size if mask is None else int(np.count_nonzero(mask))
-    if pixels == 0:
+    count = differs.size if mask is None else int(np.count_nonzero(mask))
+    if count == 0:
         return math.nan
     total = 0.0
-    for band in _bands(differs if mask is None else differs & mask, filters.radius):
-        part = _sum_of(pred, truth, band, differs, mask, background, filters)
-        if math.isnan(part):
-            return math.nan
-        total += part
-    return total / pixels
+    for band in _bands(differs, mask, filters.radius):
+        values = _flip(pred, truth, band, mask, background, filters)
+        total += float(np.sum(values if mask is None else values[mask[band]]))
+    finite = all(np.isfinite(image if mask is None else image[mask]).all() for image in (pred, truth))
+    return total / count if finite else math.nan
 
 
 def flip_map(
@@ -118,25 +118,15 @@ def flip_map(
     filters = Filters.of(ppd)
     differs = differing_pixels(pred, truth)
     values = np.zeros(differs.shape)
-    for band in _bands(differs, filters.radius):
-        _sum_of(pred, truth, band, differs, None, 1.0, filters, values)
-    if pred.dtype != np.uint8:
-        values[_near(~(np.isfinite(pred).all(2) & np.isfinite(truth).all(2)), filters.radius)] = np.nan
+    for band in _bands(differs, None, filters.radius):
+        values[band] = _flip(pred, truth, band, None, 1.0, filters)
+    if pred.dtype != np.uint8 and pred.size:
+        import cv2
+
+        bad = ~(np.isfinite(pred) & np.isfinite(truth)).all(2)
+        square = np.ones((2 * filters.radius + 1,) * 2, np.uint8)
+        values[cv2.dilate(bad.astype(np.uint8), square) > 0] = np.nan
     return values
-
-
-def _near(mask: Mask, radius: int) -> Mask:
-    """[H, W] True within a square of the radius around a True pixel."""
-    if not mask.any():
-        return mask
-    out = mask
-    for _ in range(2):  # along rows, then along columns
-        spread = out.copy()
-        for k in range(1, radius + 1):
-            spread[k:] |= out[:-k]
-            spread[:-k] |= out[k:]
-        out = spread.T
-    return out
 
 
 @dataclass(frozen=True)
@@ -151,8 +141,8 @@ class Filters:
     radius: int  # px, of `blur`; features reach less far
     blur: NDArray[np.float64]  # [4, 2 radius + 1] Y, Cx, and twice Cz
     gauss: NDArray[np.float64]  # [2 r + 1]
-    slope: NDArray[np.float64]  # [r] weights of x[k] - x[-k], k = 1 … r
-    curve: NDArray[np.float64]  # [r] weights of x[k] + x[-k] - 2 x[0]
+    slope: NDArray[np.float64]  # [2 r] weights of the differences x[k + 1] - x[k], k = -r … r - 1
+    curve: NDArray[np.float64]  # [2 r] as slope
 
     @staticmethod
     @lru_cache(maxsize=16)
@@ -168,32 +158,28 @@ class Filters:
         # the two are filtered along rows and along columns, so each direction takes the root of a share
         blur[2:] *= np.sqrt(shares / (shares * blur[2:].sum(1) ** 2).sum())[:, None]
         sigma = 0.5 * FEATURE_WIDTH * ppd
-        offset = np.arange(math.ceil(3 * sigma) + 1)
+        reach = math.ceil(3 * sigma)
+        offset = np.arange(-reach, reach + 1.0)
         gauss = np.exp(-(offset**2) / (2 * sigma**2))
-        slope = offset * gauss
-        curve = (offset**2 / sigma**2 - 1) * gauss
-        twice = np.where(offset == 0, 1, 2)  # every weight but the middle one is there on both sides
-        for sign in (1, -1):
-            of_sign = sign * curve > 0
-            curve[of_sign] /= np.abs(twice * curve)[of_sign].sum()
-        gauss /= (twice * gauss).sum()
-        return Filters(
-            radius, blur, np.concatenate([gauss[:0:-1], gauss]), slope[1:] / slope[1:].sum(), curve[1:].copy()
-        )
+        slope, curve = offset * gauss, (offset**2 / sigma**2 - 1) * gauss
+        for weights in (slope, curve):
+            for part in (weights > 0, weights < 0):
+                weights[part] /= np.abs(weights[part]).sum()
+        return Filters(radius, blur, gauss / gauss.sum(), -np.cumsum(slope)[:-1], -np.cumsum(curve)[:-1])
 
 
 @lru_cache(maxsize=1)
 def largest_color_difference() -> float:
     """HyAB between green and blue, to the power of colour differences: the largest in the sRGB gamut."""
-    green, blue = (_hunt_lab(TO_XYZ[:, channel]) for channel in (1, 2))
-    return float((abs(green[0] - blue[0]) + math.hypot(*(green[1:] - blue[1:]))) ** COLOR_EXPONENT)
+    lightness, a, b = (float(x[1] - x[2]) for x in _hunt_lab(list(TO_XYZ)))  # each of red, green, blue
+    return (abs(lightness) + math.hypot(a, b)) ** COLOR_EXPONENT
 
 
-def _hunt_lab(xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """L, a L / 100 and b L / 100 of a colour relative to white that is bright enough not to need the linear part."""
-    x, y, z = np.cbrt(xyz)
+def _hunt_lab(xyz: Sequence[Plane]) -> list[Plane]:
+    """L, a L / 100 and b L / 100 of colours X, Y, Z relative to white."""
+    x, y, z = (np.where(t > 216 / 24389, np.cbrt(t), t * (841 / 108) + 4 / 29) for t in xyz)
     lightness = 116 * y - 16
-    return np.array([lightness, 5 * lightness * (x - y), 2 * lightness * (y - z)])
+    return [lightness, 5 * lightness * (x - y), 2 * lightness * (y - z)]
 
 
 def _checked_colors(pred: Any, truth: Any, mask: Any, hdr: bool) -> tuple[NDArray, NDArray, Mask | None]:
@@ -206,71 +192,83 @@ def _checked_colors(pred: Any, truth: Any, mask: Any, hdr: bool) -> tuple[NDArra
     return pred, truth, mask
 
 
-def _bands(differs: Mask, radius: int) -> Iterator[tuple[slice, slice]]:
-    """Rectangles that hold every pixel within the radius of a differing one."""
-    area = bounds(differs)
+def _bands(differs: Mask, mask: Mask | None, radius: int) -> Iterator[tuple[slice, slice]]:
+    """Rectangles that hold every pixel of the mask within the radius of a differing one in it."""
+    area = bounds(differs if mask is None else differs & mask)
     if area is None:
         return
     rows, columns = grown(area, radius, differs.shape)
-    step = max(8 * radius, BAND // (columns.stop - columns.start))
+    if mask is not None and (inside := bounds(mask)):
+        rows, columns = (
+            slice(max(a.start, b.start), min(a.stop, b.stop)) for a, b in zip((rows, columns), inside, strict=True)
+        )
+    step = max(4 * radius, BAND // (columns.stop - columns.start))
     for top in range(rows.start, rows.stop, step):
-        band = slice(top, min(top + step, rows.stop))
-        if differs[max(band.start - radius, 0) : band.stop + radius].any():
-            yield band, columns
+        yield slice(top, min(top + step, rows.stop)), columns
 
 
-def _sum_of(
-    pred: NDArray,
-    truth: NDArray,
-    band: tuple[slice, slice],
-    differs: Mask,
-    mask: Mask | None,
+def _flip(
+    pred: NDArray,  # [H, W, 3]
+    truth: NDArray,  # [H, W, 3]
+    area: tuple[slice, slice],
+    mask: Mask | None,  # [H, W] both are painted outside it
     background: float | tuple[float, ...],
     filters: Filters,
-    values: NDArray[np.float64] | None = None,
-) -> float:
-    """The sum of FLIP over a band's pixels in the mask, NaN if one there is not finite; FLIP itself into `values`."""
-    from ihbench.metrics import flip_numba as kernel
-
-    # rows and columns that the filters reach; where the image ends earlier its outermost pixels continue it
-    outer = grown(band, filters.radius, differs.shape)
-    rows, columns = (slice(b.start - o.start, b.stop - o.start) for b, o in zip(band, outer, strict=True))
-    unequal = np.array(differs[outer], order="C")
-    inside = np.zeros((0, 0), np.bool_)
-    if mask is not None:
-        inside = np.array(mask[outer], order="C")
-        unequal &= inside
+) -> Plane:
+    """[h, w] FLIP in a rectangle; a pixel that is not finite counts as 0."""
+    outer = grown(area, filters.radius, pred.shape)  # where the image ends its outermost pixels continue it
+    inner = tuple(slice(a.start - o.start, a.stop - o.start) for a, o in zip(area, outer, strict=True))
+    outside = None if mask is None else ~mask[outer]
     paint = linear(np.clip(np.broadcast_to(np.asarray(background, np.float64), 3), 0, 1))
-    planes = _scratch((2, 3, *unequal.shape))
-    for image, channels in zip((pred, truth), planes, strict=True):
-        # own copies: the kernel would be compiled again for arrays that are read-only or not contiguous
-        part = np.array(image[outer], np.float32 if image.dtype == np.float16 else image.dtype, order="C")
-        if part.dtype == np.uint8:
-            kernel.opponent_of_bytes(part, _linear_bytes(), inside, paint, TO_XYZ, channels)
-        elif not kernel.opponent_of_floats(part, inside, paint, TO_XYZ, channels) and values is None:
-            return math.nan
-    weights = kernel.whole_groups(filters.blur, filters.gauss, filters.slope, filters.curve)
-    remap = np.array([COLOR_EXPONENT, KNEE_AT, KNEE, largest_color_difference()])
-    keep = np.zeros(unequal.shape if values is not None else (0, 0))
-    total = kernel.flip_rows(
-        planes[0], planes[1], unequal, inside, rows.start, rows.stop, filters.radius, *weights,
-        TO_XYZ, TO_RGB, remap, keep,
-    )  # fmt: skip
-    if values is not None:
-        values[band] = keep[rows, columns]
-    return total
+    first, second = (_seen(_opponent(image[outer], outside, paint), inner, filters) for image in (pred, truth))
+    lightness, a, b, edge, point = (np.abs(x - y) for x, y in zip(first, second, strict=True))
+    color = (lightness + np.sqrt(a * a + b * b)) ** COLOR_EXPONENT / largest_color_difference()
+    color = np.minimum(color * (KNEE / KNEE_AT), KNEE + (color - KNEE_AT) * ((1 - KNEE) / (1 - KNEE_AT)))
+    return color ** (1 - np.sqrt(np.maximum(edge, point) * math.sqrt(0.5)))
 
 
-_OWN = local()
+def _opponent(image: NDArray, outside: Mask | None, paint: NDArray[np.float64]) -> list[Plane]:
+    """Y, Cx, Cz of an image [h, w, 3] painted with linear RGB [3] outside."""
+    if image.dtype == np.uint8:
+        rgb = [_linear_bytes()[image[..., c]] for c in range(3)]
+    else:
+        finite = np.where(np.isfinite(image), image, 0).astype(np.float64)
+        rgb = [linear(np.clip(finite[..., c], 0, 1)) for c in range(3)]
+    if outside is not None:
+        for plane, color in zip(rgb, paint, strict=True):
+            plane[outside] = color
+    x, y, z = _product(TO_XYZ, rgb)
+    return [y, x - y, y - z]
 
 
-def _scratch(shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """An array of this thread that is used again: fresh memory of this size costs as much as what is put into it."""
-    size = math.prod(shape)
-    kept = getattr(_OWN, "planes", None)
-    if kept is None or len(kept) < size:
-        kept = _OWN.planes = np.empty(size)
-    return kept[:size].reshape(shape)
+def _seen(opponent: list[Plane], inner: tuple[slice, ...], filters: Filters) -> list[Plane]:
+    """L, a and b of `_hunt_lab` after the blur, and the strengths of edges and of points, in the inner rectangle."""
+    import cv2
+
+    def filtered(plane: Plane, weights_x: NDArray, weights_y: NDArray, anchor: tuple[int, int] = (-1, -1)) -> Plane:
+        blurred = cv2.sepFilter2D(
+            plane, cv2.CV_64F, weights_x, weights_y, anchor=anchor, borderType=cv2.BORDER_REPLICATE
+        )
+        return np.asarray(blurred, np.float64)[inner]
+
+    y, cx, cz, cz_2 = (filtered(opponent[min(k, 2)], blur, blur) for k, blur in enumerate(filters.blur))
+    rgb = [np.clip(plane, 0, 1) for plane in _product(TO_RGB, [y + cx, y, y - cz - cz_2])]
+    strengths = []
+    # differences between neighbours, 0 at both ends and so beyond them
+    steps_x = np.diff(np.pad(opponent[0], ((0, 0), (1, 1)), "edge"), axis=1)
+    steps_y = np.diff(np.pad(opponent[0], ((1, 1), (0, 0)), "edge"), axis=0)
+    for weights in (filters.slope, filters.curve):
+        middle = len(weights) // 2 - 1
+        along_x = filtered(steps_x, weights, filters.gauss, (middle, -1))
+        along_y = filtered(steps_y, filters.gauss, weights, (-1, middle))
+        strengths.append(np.sqrt(along_x * along_x + along_y * along_y))
+    return [*_hunt_lab(_product(TO_XYZ, rgb)), *strengths]
+
+
+def _product(matrix: NDArray[np.float64], planes: list[Plane]) -> list[Plane]:
+    """A matrix [3, 3] times three planes. Not by BLAS: all pixels of one colour must come out the same."""
+    a, b, c = planes
+    return [row[0] * a + row[1] * b + row[2] * c for row in matrix]
 
 
 def linear(srgb: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -281,4 +279,4 @@ def linear(srgb: NDArray[np.float64]) -> NDArray[np.float64]:
 @lru_cache(maxsize=1)
 def _linear_bytes() -> NDArray[np.float64]:
     """[256] linear RGB of every 8-bit value."""
-    return linear(np.arange(256) / peak_of(np.dtype(np.uint8)))
+    return linear(np.arange(256) / 255)

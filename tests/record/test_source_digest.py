@@ -41,7 +41,7 @@ OF_THE_BENCH = [
         "ihbench/scene/regions.py",
         "ihbench/scene/visibility.py",
     ),
-    *("ihbench/metrics/ssim.py", "ihbench/metrics/flip_numba.py", "ihbench/metrics/presets.py"),
+    *("ihbench/metrics/ssim.py", "ihbench/metrics/flip.py", "ihbench/metrics/presets.py"),
     *(
         "ihbench/scoring/scoring.py",
         "ihbench/runner/score_stage.py",
