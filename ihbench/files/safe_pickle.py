@@ -4,23 +4,30 @@ A pickle is a program. This reader executes it with nothing to call but a handfu
 only build plain Python values and numpy arrays of numbers, text or objects. chumpy and scipy.sparse objects, which
 old SMPL files hold, come back as inert `ForeignObject`s that carry their state.
 
-Nor can a small file keep the reader or its caller busy: what shared references multiply is counted and bounded,
-keys are looked at before they are hashed, and nothing is allocated that the file does not hold.
+Memory is bounded by the file's size: nothing is allocated that the file does not hold, and what shared references
+multiply is counted. A file that is made to be slow can still be that, or end the process; it cannot run anything.
 """
 
 from __future__ import annotations
 
 import io
 import math
+import os
 import pickle
+import pickletools
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Any, ClassVar
+from typing import IO, Any
 
 import numpy as np
 
 from ihbench.errors import BadInput
 from ihbench.files.regular import opened
+
+LARGEST = 4 * 2**30  # bytes of a file
+# what a file may grow to: honest ones share little, and stay far below
+BYTES, BYTES_A_FILE_BYTE = 2**20, 64
+VALUES, VALUES_A_FILE_BYTE = 10**6, 100
 
 
 class ForeignObject:
@@ -34,6 +41,11 @@ class ForeignObject:
         self.state = {}
         return self
 
+    def __setstate__(self, state: object) -> None:
+        for part in state[:2] if isinstance(state, tuple) else (state,):  # attributes, or else slots
+            if isinstance(part, dict) and part:
+                self.state = part
+
 
 class _DtypeRecord:
     """A numpy dtype as a pickle spells it, checked before numpy sees it."""
@@ -44,7 +56,7 @@ class _DtypeRecord:
         self.name = name
         self.order = "="
 
-    def set_state(self, state: tuple) -> None:
+    def __setstate__(self, state: tuple) -> None:
         _version, order, subarray, names, fields = state[:5]
         if subarray is not None or names is not None or fields is not None or order not in ("<", ">", "=", "|"):
             raise pickle.UnpicklingError("refused a structured numpy dtype")
@@ -63,30 +75,17 @@ class _ArrayRecord:
     def __init__(self) -> None:
         self.state: tuple = ((0,), _DtypeRecord("u1"), False, b"")
 
-    def set_state(self, state: tuple) -> None:
+    def __setstate__(self, state: tuple) -> None:
         self.state = state[-4:]  # a version number may stand before them
 
 
-class _NdarrayClass:
-    """What the name `numpy.ndarray` becomes: a token for `_reconstruct`, nothing that can be called."""
-
-
-def _check_key(key: object) -> None:
-    """Hashing a tuple takes time and C stack for everything below it: only small ones may be keys."""
-    if type(key) in _LEAF_TYPES:
-        return
-    waiting, parts = [key], 0
-    while waiting:
-        part = waiting.pop()
-        parts += 1
-        if isinstance(part, tuple) and parts + len(waiting) + len(part) <= _KEY_PARTS:
-            waiting.extend(part)
-        elif not isinstance(part, _KEY_TYPES):
-            raise pickle.UnpicklingError("refused a key that is not plain, or too large")
+def _ndarray() -> None:
+    """`numpy.ndarray` is only ever named for `_reconstruct`."""
+    raise pickle.UnpicklingError("refused to call numpy.ndarray")
 
 
 def _reconstruct(cls: object, _shape: object, _typecode: object) -> _ArrayRecord:
-    if cls is not _NDARRAY:
+    if not isinstance(cls, _Allowed) or cls.function is not _ndarray:
         raise pickle.UnpicklingError("refused an array of another class than numpy.ndarray")
     return _ArrayRecord()
 
@@ -122,30 +121,13 @@ def _empty_bytes() -> bytes:
     return b""
 
 
-def _set(items: list | tuple = ()) -> set:
-    if not isinstance(items, list | tuple):
-        raise pickle.UnpicklingError("refused a set of something that is not a list")
-    for item in items:
-        _check_key(item)
-    return set(items)
-
-
-def _ordered_dict(pairs: list | tuple = ()) -> dict:
-    if not isinstance(pairs, list | tuple):
-        raise pickle.UnpicklingError("refused a dictionary of something that is not a list")
-    for key, _value in pairs:
-        _check_key(key)
-    return {key: value for key, value in pairs}
-
-
 def _object() -> None:
     """`object` is only ever named as the base class of `_reconstructor`."""
 
 
-_NDARRAY = _NdarrayClass()
 _NUMPY_CORES = ("numpy.core", "numpy._core")
-_ALLOWED: dict[tuple[str, str], object] = {
-    ("numpy", "ndarray"): _NDARRAY,
+_ALLOWED: dict[tuple[str, str], Callable] = {
+    ("numpy", "ndarray"): _ndarray,
     ("numpy", "dtype"): _DtypeRecord,
     **{(f"{core}.multiarray", "_reconstruct"): _reconstruct for core in _NUMPY_CORES},
     **{(f"{core}.multiarray", "scalar"): _scalar for core in _NUMPY_CORES},
@@ -153,19 +135,44 @@ _ALLOWED: dict[tuple[str, str], object] = {
     **{(module, "_reconstructor"): _reconstructor for module in ("copy_reg", "copyreg")},
     **{(module, "object"): _object for module in ("__builtin__", "builtins")},
     **{(module, "bytes"): _empty_bytes for module in ("__builtin__", "builtins")},
-    **{(module, "set"): _set for module in ("__builtin__", "builtins")},
-    ("collections", "OrderedDict"): _ordered_dict,
+    **{(module, "set"): set for module in ("__builtin__", "builtins")},
+    ("collections", "OrderedDict"): dict,
     ("_codecs", "encode"): _encode,
 }
 _INERT_PACKAGES = ("chumpy", "scipy.sparse")
+_LEAVES = (str, bytes, bytearray, int, float, complex, type(None), np.generic)
+_OPCODES = {opcode.code: opcode for opcode in pickletools.opcodes}
+_REFUSED = ("EXT1", "EXT2", "EXT4", "PERSID", "BINPERSID", "NEXT_BUFFER", "READONLY_BUFFER", "NEWOBJ_EX")
+_LENGTHS = {  # how many bytes say how long an opcode's argument is
+    pickletools.TAKEN_FROM_ARGUMENT1: 1,
+    pickletools.TAKEN_FROM_ARGUMENT4: 4,
+    pickletools.TAKEN_FROM_ARGUMENT4U: 4,
+    pickletools.TAKEN_FROM_ARGUMENT8U: 8,
+}
 
-# What shared references may multiply. Honest files stay far below: they share little.
-_COPIED_BYTES, _COPIED_BYTES_A_FILE_BYTE = 2**20, 64
-_EXPANDED_VALUES, _EXPANDED_A_STORED_ONE = 10**6, 100
-_BYTES_AN_ITEM, _BYTES_A_CLASS = 64, 2000
-_KEY_PARTS = 1000
-_LEAF_TYPES = frozenset((float, int, str, bytes, bool, type(None)))
-_KEY_TYPES = (str, bytes, int, float, complex, type(None), np.generic, frozenset, ForeignObject)
+
+def _check_opcodes(data: bytes) -> None:
+    """Refuse opcodes that no data file needs, and sizes and places that the file does not hold."""
+    at = 0
+    while data[at] != pickle.STOP[0]:
+        opcode = _OPCODES[chr(data[at])]
+        size = opcode.arg.n if opcode.arg else 0
+        at += 1
+        if size == pickletools.UP_TO_NEWLINE:
+            start = at
+            for _ in range(2 if opcode.name in ("GLOBAL", "INST") else 1):
+                at = data.index(b"\n", at) + 1
+        else:
+            length = _LENGTHS.get(size, 0)
+            start, size = at + length, int.from_bytes(data[at : at + length], "little") if length else size
+            at = start + size
+        if opcode.name in _REFUSED:
+            raise pickle.UnpicklingError("refused: an opcode that no data file needs")
+        place = int(data[start:at]) if opcode.name == "PUT" else 0
+        if opcode.name == "LONG_BINPUT":
+            place = int.from_bytes(data[start:at], "little")
+        if max(at, place) >= len(data):
+            raise pickle.UnpicklingError("pickle data was truncated")
 
 
 def _as_bytes(data: object) -> bytes | bytearray:
@@ -177,211 +184,143 @@ def _as_bytes(data: object) -> bytes | bytearray:
     raise pickle.UnpicklingError("expected the bytes of a numpy array")
 
 
-# The pure-Python unpickler, because its opcodes can be replaced, its memo is a dictionary (the C one allocates as
-# many slots as the highest index a file names) and the extension registry, which bypasses `find_class`, can be shut.
-_PythonUnpickler: Any = pickle._Unpickler  # pyright: ignore[reportAttributeAccessIssue]
+class _Allowed:
+    """A function that a pickle may call, and nothing else: BUILD cannot change it."""
 
+    __slots__ = ("function", "spend")
 
-def _checking_keys(opcode: bytes, step: int) -> Callable:
-    """The opcode that hashes every `step`-th item above the mark, with a look at those before."""
-    plain = _PythonUnpickler.dispatch[opcode[0]]
+    def __init__(self, function: Callable, spend: Callable[[object], None]):
+        self.function, self.spend = function, spend
 
-    def load(self: SafeUnpickler) -> None:
-        for key in self.stack[::step]:
-            _check_key(key)
-        plain(self)
+    def __call__(self, *arguments: object) -> Any:
+        for argument in arguments:
+            self.spend(argument)
+        return self.function(*arguments)
 
-    return load
-
-
-class SafeUnpickler(_PythonUnpickler):
-    """An unpickler that can only build plain values, numpy arrays and `ForeignObject`s."""
-
-    dispatch: ClassVar[dict[int, Callable]] = dict(_PythonUnpickler.dispatch)
-
-    def __init__(self, data: io.BytesIO, **options: Any):
-        super().__init__(data, **options)
-        self._allowance = _COPIED_BYTES + _COPIED_BYTES_A_FILE_BYTE * data.getbuffer().nbytes
-        self._foreign: dict[tuple[str, str], type] = {}
-
-    def find_class(self, module: str, name: str) -> Any:
-        if (module, name) in _ALLOWED:
-            return _ALLOWED[module, name]
-        if any(module == package or module.startswith(package + ".") for package in _INERT_PACKAGES):
-            if (module, name) not in self._foreign:
-                self._spend(_BYTES_A_CLASS)
-                self._foreign[module, name] = type(name, (ForeignObject,), {"kind": f"{module}.{name}"})
-            return self._foreign[module, name]
-        raise pickle.UnpicklingError(f"refused: the file asks for {module}.{name}")
-
-    def load(self) -> Any:
-        """The value in the pickle, with real numpy arrays in it."""
-        value = _resolve(super().load(), {}, self._spend)
-        _check_expansion(value)
-        return value
-
-    def _spend(self, size: int) -> None:
-        """Count bytes that are about to be copied from what the file may name again and again."""
-        self._allowance -= size
-        if self._allowance < 0:
-            raise pickle.UnpicklingError("refused: a small file that grows too large")
-
-    def _spend_on(self, value: object) -> None:
-        if isinstance(value, str | bytes | bytearray):
-            self._spend(len(value))
-        elif isinstance(value, list | tuple | dict | set | frozenset):
-            self._spend(_BYTES_AN_ITEM * len(value))
-
-    def _load_reduce(self) -> None:
-        """A call gets a copy of its arguments, and some of what can be called copies them again."""
-        arguments = self.stack[-1]
-        self._spend_on(arguments)
-        if isinstance(arguments, tuple):
-            for argument in arguments:
-                self._spend_on(argument)
-        _PythonUnpickler.load_reduce(self)
-
-    def _load_newobj(self) -> None:
-        self._spend_on(self.stack[-1])
-        _PythonUnpickler.load_newobj(self)
-
-    def _load_setitem(self) -> None:
-        _check_key(self.stack[-2])
-        _PythonUnpickler.load_setitem(self)
-
-    def _refuse(self) -> None:
-        raise pickle.UnpicklingError("refused: an opcode that no data file needs")
-
-    def _load_build(self) -> None:
-        """BUILD sets attributes of whatever lies on the stack; here only records and foreign objects take a state."""
-        state = self.stack.pop()
-        target = self.stack[-1]
-        if isinstance(target, _ArrayRecord | _DtypeRecord):
-            target.set_state(state)
-        elif isinstance(target, ForeignObject):
-            for part in state[:2] if isinstance(state, tuple) else (state,):  # attributes, then slots
-                if isinstance(part, dict):
-                    self._spend_on(part)
-                    target.state.update(part)
-        else:
-            raise pickle.UnpicklingError(f"refused to change a {type(target).__name__}")
-
-    def _load_bytearray8(self) -> None:
-        size = int.from_bytes(self.read(8), "little")
-        data = self.read(size)
-        if len(data) != size:
-            raise pickle.UnpicklingError("pickle data was truncated")
-        self.append(bytearray(data))
-
-    dispatch[pickle.BUILD[0]] = _load_build
-    dispatch[pickle.BYTEARRAY8[0]] = _load_bytearray8
-    dispatch[pickle.REDUCE[0]] = _load_reduce
-    dispatch[pickle.NEWOBJ[0]] = _load_newobj
-    dispatch[pickle.SETITEM[0]] = _load_setitem
-    for _opcode, _step in ((pickle.SETITEMS, 2), (pickle.DICT, 2), (pickle.ADDITEMS, 1), (pickle.FROZENSET, 1)):
-        dispatch[_opcode[0]] = _checking_keys(_opcode, _step)
-    for _opcode in (
-        *(pickle.EXT1, pickle.EXT2, pickle.EXT4),
-        *(pickle.PERSID, pickle.BINPERSID, pickle.NEXT_BUFFER, pickle.READONLY_BUFFER, pickle.NEWOBJ_EX),
-    ):
-        dispatch[_opcode[0]] = _refuse
+    def __setstate__(self, _state: object) -> None:
+        raise pickle.UnpicklingError("refused to change a function")
 
 
 _UNFINISHED: Any = object()
 
 
-def _resolve(value: Any, done: dict[int, tuple[Any, Any]], spend: Callable[[int], None]) -> Any:
-    """Replace the array records in a value by arrays. `done` maps id -> (original, result), so that a value shared in
-    many places is visited once; it holds the original, too, to keep its id taken."""
-    if not isinstance(value, list | dict | tuple | _ArrayRecord | _DtypeRecord | ForeignObject):
-        if isinstance(value, type) or callable(value) or isinstance(value, _NdarrayClass):
-            raise pickle.UnpicklingError("expected data, found a function")
+class SafeUnpickler(pickle.Unpickler):
+    """An unpickler that can only build plain values, numpy arrays and `ForeignObject`s."""
+
+    def __init__(self, data: bytes):
+        _check_opcodes(data)
+        super().__init__(io.BytesIO(data), encoding="latin1")  # maps the bytes of python-2 strings one to one
+        self._bytes = BYTES + BYTES_A_FILE_BYTE * len(data)
+        self._values = VALUES + VALUES_A_FILE_BYTE * len(data)
+        self._foreign: dict[tuple[str, str], type] = {}
+        # id -> (original, result, values in it), so that a value shared in many places is visited once; the original
+        # is there to keep its id taken
+        self._done: dict[int, tuple[Any, Any, int]] = {}
+
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) in _ALLOWED:
+            return _Allowed(_ALLOWED[module, name], self._spend)
+        if any(module == package or module.startswith(package + ".") for package in _INERT_PACKAGES):
+            kind = {"kind": f"{module}.{name}"}
+            return self._foreign.setdefault((module, name), type(name, (ForeignObject,), kind))
+        raise pickle.UnpicklingError(f"refused: the file asks for {module}.{name}")
+
+    def load(self) -> Any:
+        """The value in the pickle, with real numpy arrays in it."""
+        value, count = self._resolve(super().load())
+        if count > self._values:
+            raise pickle.UnpicklingError("refused: a few values, referred to so often that they stand for too many")
         return value
-    if id(value) in done:
-        if done[id(value)][1] is _UNFINISHED:
+
+    def _spend(self, value: object) -> None:
+        """Count bytes that are about to be copied from what the file may name again and again."""
+        if isinstance(value, str | bytes | bytearray):
+            self._bytes -= len(value)
+        elif isinstance(value, list | tuple | dict | set | frozenset):
+            self._bytes -= 64 * len(value)
+        if self._bytes < 0:
+            raise pickle.UnpicklingError("refused: a small file that grows too large")
+
+    def _resolve(self, value: Any) -> tuple[Any, int]:
+        """The value with arrays in the place of records, and how many values it stands for."""
+        if isinstance(value, _LEAVES):
+            return value, 1
+        if id(value) not in self._done:
+            open_ended = isinstance(value, list | dict | ForeignObject)  # these may hold themselves
+            self._done[id(value)] = value, value if open_ended else _UNFINISHED, 1
+            self._done[id(value)] = value, *self._resolved(value)
+        _, result, count = self._done[id(value)]
+        if result is _UNFINISHED:
             raise pickle.UnpicklingError("refused an array or a tuple that holds itself")
-        return done[id(value)][1]
-    done[id(value)] = (value, _UNFINISHED if isinstance(value, tuple | _ArrayRecord) else value)
-    if isinstance(value, list):
-        value[:] = [_resolve(item, done, spend) for item in value]
-    elif isinstance(value, dict):
-        for key in value:
-            value[key] = _resolve(value[key], done, spend)
-    elif isinstance(value, ForeignObject):
-        _resolve(value.state, done, spend)
-    elif isinstance(value, tuple):
-        done[id(value)] = (value, tuple([_resolve(item, done, spend) for item in value]))
-    elif isinstance(value, _ArrayRecord):
-        done[id(value)] = (value, _build_array(value, done, spend))
-    elif isinstance(value, _DtypeRecord):
-        done[id(value)] = (value, value.resolve())
-    return done[id(value)][1]
+        return result, count
+
+    def _resolved(self, value: Any) -> tuple[Any, int]:
+        if isinstance(value, list | tuple):
+            parts = [self._resolve(item) for item in value]
+            items, count = [item for item, _ in parts], 1 + sum(n for _, n in parts)
+            if isinstance(value, tuple):
+                return tuple(items), count
+            value[:] = items
+            return value, count
+        if isinstance(value, dict):
+            _check_keys(value)
+            count = 1
+            for key in value:
+                value[key], n = self._resolve(value[key])
+                count += n
+            return value, count
+        if isinstance(value, set | frozenset):
+            _check_keys(value)
+            return value, 1 + len(value)
+        if isinstance(value, ForeignObject):
+            return value, 1 + self._resolve(value.state)[1]
+        if isinstance(value, _ArrayRecord):
+            return self._array(*value.state)
+        if isinstance(value, _DtypeRecord):
+            return value.resolve(), 1
+        raise pickle.UnpicklingError("expected data, found a function")
+
+    def _array(self, shape: Any, record: Any, fortran: Any, data: Any) -> tuple[np.ndarray, int]:
+        if (
+            not isinstance(shape, tuple)
+            or not all(type(n) is int and 0 <= n < 2**63 for n in shape)
+            or len(shape) > 32
+        ):
+            raise pickle.UnpicklingError("the shape of an array is not a few whole numbers")
+        if not isinstance(record, _DtypeRecord):
+            raise pickle.UnpicklingError("an array has no numpy dtype")
+        dtype, count, order = record.resolve(), math.prod(shape), "F" if fortran else "C"
+        self._spend(data)
+        if dtype.hasobject:
+            if not isinstance(data, list) or len(data) != count:
+                raise pickle.UnpicklingError(f"an object array of shape {shape} does not hold {count} objects")
+            flat, values = np.empty(count, object), 1
+            for i, item in enumerate(data):
+                flat[i], n = self._resolve(item)
+                values += n
+            return flat.reshape(shape, order=order), values
+        raw = _as_bytes(data)
+        if len(raw) != count * dtype.itemsize or (count and not dtype.itemsize):
+            raise pickle.UnpicklingError(
+                f"an array of shape {shape} and {dtype} needs {count * dtype.itemsize} bytes, the file has {len(raw)}"
+            )
+        array = np.frombuffer(raw, dtype, count) if count else np.zeros(0, dtype)
+        return np.array(array.reshape(shape, order=order), dtype=dtype.newbyteorder("="), order=order), 1
 
 
-def _build_array(record: _ArrayRecord, done: dict[int, tuple[Any, Any]], spend: Callable[[int], None]) -> np.ndarray:
-    shape, dtype_record, fortran, data = record.state
-    if not isinstance(shape, tuple) or not all(type(n) is int and 0 <= n < 2**63 for n in shape) or len(shape) > 32:
-        raise pickle.UnpicklingError("the shape of an array is not a few whole numbers")
-    if not isinstance(dtype_record, _DtypeRecord):
-        raise pickle.UnpicklingError("an array has no numpy dtype")
-    dtype = dtype_record.resolve()
-    count = math.prod(shape)
-    order = "F" if fortran else "C"
-    if dtype.hasobject:
-        if not isinstance(data, list) or len(data) != count:
-            raise pickle.UnpicklingError(f"an object array of shape {shape} does not hold {count} objects")
-        spend(8 * count)
-        flat = np.empty(count, object)
-        for i, item in enumerate(data):
-            flat[i] = _resolve(item, done, spend)
-        return flat.reshape(shape, order=order)
-    spend(len(data) if isinstance(data, str) else 0)
-    raw = _as_bytes(data)
-    if len(raw) != count * dtype.itemsize or (count and not dtype.itemsize):
-        raise pickle.UnpicklingError(
-            f"an array of shape {shape} and {dtype} needs {count * dtype.itemsize} bytes, the file has {len(raw)}"
-        )
-    spend(len(raw))
-    array = np.frombuffer(raw, dtype, count) if count else np.zeros(0, dtype)
-    native = dtype.newbyteorder("=")
-    return np.array(array.reshape(shape, order=order), dtype=native, order=order)
-
-
-def _check_expansion(value: Any) -> None:
-    """Refuse a few values that refer to each other so often that walking through them would never end."""
-    sizes: dict[int, int] = {}  # id of a container -> values in it, shared ones counted wherever they occur
-    stored = 0
-
-    def expanded(value: Any) -> int:
-        nonlocal stored
-        if type(value) in _LEAF_TYPES:
-            return 1
-        if isinstance(value, list | tuple | set | frozenset):
-            parts: Any = value
-        elif isinstance(value, dict):
-            parts = value.values()
-        elif isinstance(value, ForeignObject):
-            parts = value.state.values()
-        elif isinstance(value, np.ndarray) and value.dtype.hasobject:
-            parts = value.ravel().tolist()
-        else:
-            return 1
-        if id(value) not in sizes:
-            sizes[id(value)] = 1  # a value that holds itself counts once
-            stored += len(parts)
-            sizes[id(value)] += sum([expanded(part) for part in parts])
-        return sizes[id(value)]
-
-    if expanded(value) > _EXPANDED_VALUES + _EXPANDED_A_STORED_ONE * stored:
-        raise pickle.UnpicklingError("refused: a few values, referred to so often that they stand for too many")
+def _check_keys(keys: Any) -> None:
+    for key in keys:
+        if not all(
+            isinstance(part, (*_LEAVES, ForeignObject)) for part in (key if isinstance(key, tuple) else [key])
+        ):
+            raise pickle.UnpicklingError("refused a key that is not plain")
 
 
 def _unpickle(stream: IO[bytes], path: Path) -> Any:
-    # in memory, so that a length that goes past the end of the file is cut to it before anything is allocated
-    data = io.BytesIO(stream.read())
+    if os.fstat(stream.fileno()).st_size > LARGEST:
+        raise BadInput(f"{path}: larger than {LARGEST // 2**30} GiB; expected a pickle of plain data")
     try:
-        # latin1 maps the bytes of python-2 strings one to one
-        return SafeUnpickler(data, encoding="latin1").load()
+        return SafeUnpickler(stream.read()).load()
     except Exception as error:
         # a broken or hostile program can fail in any way: what is on the stack need not be what an opcode expects
         reason = " ".join(str(error)[:200].split()) or type(error).__name__

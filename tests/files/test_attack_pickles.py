@@ -7,14 +7,12 @@ import codecs
 import contextlib
 import copyreg
 import functools
-import importlib
 import operator
 import os
 import pickle
 import struct
 import subprocess
 import sys
-import textwrap
 import time
 import tracemalloc
 from pathlib import Path
@@ -128,56 +126,33 @@ def programs(mark: Path) -> dict[str, bytes]:
     return {
         "os.system": call(g("os", "system"), *run) + STOP,
         "posix.system": pickle.dumps(Reduced(os.system, shell)),
-        "nt.system": call(g("nt", "system"), *run) + STOP,
-        "os.popen": call(g("os", "popen"), *run) + STOP,
-        "os.execv": call(g("os", "execv"), s("/bin/touch"), b"](" + s("touch") + s(str(mark)) + b"e") + STOP,
-        "subprocess.Popen": pickle.dumps(Reduced(subprocess.Popen, ["touch", str(mark)])),
         "subprocess.run": pickle.dumps(Reduced(subprocess.run, ["touch", str(mark)]), 0),
         "builtins.eval": pickle.dumps(Reduced(builtins.eval, code)),
         "builtins.exec": pickle.dumps(Reduced(builtins.exec, code), 0),
-        "__builtin__.execfile": call(g("__builtin__", "execfile"), s(str(mark))) + STOP,
         "builtins.compile": call(g("builtins", "exec"), call(g("builtins", "compile"), s(code), s(""), s("exec")))
         + STOP,
         "builtins.getattr": call(
             call(g("builtins", "getattr"), call(g("builtins", "__import__"), s("os")), s("system")), *run
         )
         + STOP,
-        "builtins.__import__": call(g("builtins", "__import__"), s("antigravity")) + STOP,
         "builtins.open": call(g("builtins", "open"), s(str(mark)), s("w")) + STOP,
-        "io.open": call(g("io", "open"), s(str(mark)), s("w")) + STOP,
         "builtins.map": call(
             g("builtins", "list"), call(g("builtins", "map"), g("os", "system"), b"](" + s(shell) + b"e")
         )
         + STOP,
         "builtins.type": call(g("builtins", "type"), s("X"), b")", b"}") + STOP,
-        "builtins.setattr": call(g("builtins", "setattr"), NDARRAY, s("x"), b"N") + STOP,
-        "importlib.import_module": pickle.dumps(Reduced(importlib.import_module, "antigravity")),
-        "functools.partial": pickle.dumps(Reduced(functools.partial, os.system, shell)),
         "functools.partial called": call(call(g("functools", "partial"), g("os", "system")), *run) + STOP,
         "functools.reduce": call(g("functools", "reduce"), g("builtins", "exec"), b"](" + s(code) + b"}e") + STOP,
-        "operator.attrgetter": call(call(g("operator", "attrgetter"), s("system")), g("os", "path")) + STOP,
         "operator.methodcaller": pickle.dumps(Reduced(operator.methodcaller, "system", shell)),
-        "types.FunctionType": call(g("types", "FunctionType"), b"N", b"}") + STOP,
-        "ctypes": call(g("ctypes", "CDLL"), b"N") + STOP,
-        "pty.spawn": call(g("pty", "spawn"), *run) + STOP,
-        "webbrowser.open": call(g("webbrowser", "open"), s("file:///")) + STOP,
         "timeit.timeit": call(g("timeit", "timeit"), s("pass"), s(code)) + STOP,
-        "runpy.run_path": call(g("runpy", "run_path"), s(str(mark))) + STOP,
         "pickle.loads": call(g("pickle", "loads"), b(call(g("os", "system"), *run) + STOP)) + STOP,
-        "pickle.Unpickler": call(g("_pickle", "Unpickler"), b"N") + STOP,
         # allowed modules, other names
-        "numpy.load": call(g("numpy", "load"), s(str(mark)), b"N\x88") + STOP,
         "numpy.savetxt": call(g("numpy", "savetxt"), s(str(mark)), b"](K\x01e") + STOP,
         "numpy.memmap": call(g("numpy", "memmap"), s(str(mark)), s("u1"), s("w+"), b"I0\n", b"I1\n") + STOP,
-        "numpy.fromfile": call(g("numpy", "fromfile"), s("/etc/passwd")) + STOP,
-        "numpy.core.multiarray.fromfile": call(g("numpy.core.multiarray", "fromfile"), s("/etc/passwd")) + STOP,
         "numpy.core.multiarray dotted": b"\x80\x04" + call(sg("numpy.core.multiarray", "os.system"), *run) + STOP,
         "numpy.core.numeric dotted": b"\x80\x04" + call(sg("numpy._core.numeric", "sys.modules"), *run) + STOP,
         "numpy.core.multiarray.__builtins__": g("numpy.core.multiarray", "__builtins__") + STOP,
-        "numpy.f2py": call(g("numpy.f2py", "compile"), s(code)) + STOP,
         "numpy.testing runstring": call(g("numpy.testing._private.utils", "runstring"), s(code), b"}") + STOP,
-        "numpy.lib.npyio.DataSource": call(g("numpy.lib.npyio", "DataSource"), s(str(mark.parent / "made"))) + STOP,
-        "numpy.distutils": call(g("numpy.distutils.exec_command", "exec_command"), *run) + STOP,
         "numpy.ndarray.tofile": b"\x80\x04" + call(sg("numpy", "ndarray.tofile"), EMPTY_ARRAY, s(str(mark))) + STOP,
         "ndarray.tofile by getattr": call(call(g("builtins", "getattr"), EMPTY_ARRAY, s("tofile")), s(str(mark)))
         + STOP,
@@ -185,7 +160,6 @@ def programs(mark: Path) -> dict[str, bytes]:
         "_reconstruct of a foreign class": call(RECONSTRUCT, g("subprocess", "Popen"), b"K\x00\x85", b(b"b")) + STOP,
         "_reconstruct of a subclass": call(RECONSTRUCT, g("numpy", "memmap"), b"K\x00\x85", b(b"b")) + STOP,
         "_reconstruct of an inert class": call(RECONSTRUCT, g("chumpy", "Ch"), b"K\x00\x85", b(b"b")) + STOP,
-        "numpy.rec": call(g("numpy.core.records", "fromfile"), s("/etc/passwd")) + STOP,
         # copyreg
         "copyreg._reconstructor of dict": call(
             g("copyreg", "_reconstructor"), g("builtins", "dict"), g("builtins", "object"), b"N"
@@ -199,9 +173,7 @@ def programs(mark: Path) -> dict[str, bytes]:
             g("copyreg", "_reconstructor"), DTYPE, g("builtins", "object"), b"N"
         )
         + STOP,
-        "copyreg.__newobj__": call(g("copyreg", "__newobj__"), g("subprocess", "Popen")) + STOP,
         "copyreg.__newobj_ex__": call(g("copyreg", "__newobj_ex__"), NDARRAY, b")", b"}") + STOP,
-        "copyreg.add_extension": call(g("copyreg", "add_extension"), s("os"), s("system"), b"I7\n") + STOP,
         # BUILD
         "BUILD on a module": g("os", "path") + b"}" + s("x") + b"Nsb" + STOP,
         "BUILD on a reader's function": RECONSTRUCT + b"}" + s("__code__") + b"Nsb" + STOP,
@@ -230,29 +202,20 @@ def programs(mark: Path) -> dict[str, bytes]:
         "STACK_GLOBAL dotted": b"\x80\x04" + call(sg("builtins", "str.format"), s("{0.__class__}"), b"N") + STOP,
         "STACK_GLOBAL of os": b"\x80\x04" + call(sg("os", "path.os.system"), *run) + STOP,
         "STACK_GLOBAL without texts": b"\x80\x04NN\x93" + STOP,
-        "STACK_GLOBAL of an empty name": b"\x80\x04" + sg("numpy", "") + STOP,
         "GLOBAL dotted in protocol 4": b"\x80\x04" + call(g("builtins", "object.__subclasses__")) + STOP,
         "GLOBAL dotted in an allowed name": b"\x80\x04" + g("numpy", "dtype.__init__.__globals__") + STOP,
         "REDUCE of a text": s("os.system") + b")R" + STOP,
         "REDUCE of a foreign object": call(call(g("chumpy", "Ch")), *run) + STOP,
         # codecs
         "codecs.decode": pickle.dumps(Reduced(codecs.decode, b"x\x9c\x03\x00\x00\x00\x00\x01", "zlib")),
-        "codecs.encode": call(g("codecs", "encode"), s("a"), s("rot13")) + STOP,
         "_codecs.encode to rot13": call(g("_codecs", "encode"), s("a"), s("rot13")) + STOP,
-        "_codecs.encode to punycode": call(g("_codecs", "encode"), s("a" * 99), s("punycode")) + STOP,
         "_codecs.encode of bytes": call(g("_codecs", "encode"), b(b"a"), s("latin1")) + STOP,
-        "_codecs.lookup": call(g("_codecs", "lookup"), s("zlib")) + STOP,
-        "_codecs.register": call(g("_codecs", "register"), g("os", "system")) + STOP,
         # torch
         "torch.storage._load_from_bytes": call(g("torch.storage", "_load_from_bytes"), b(b"\x80\x02" + code.encode()))
         + STOP,
-        "torch._utils._rebuild_tensor_v2": call(g("torch._utils", "_rebuild_tensor_v2"), b"N") + STOP,
-        "torch.load": call(g("torch", "load"), s(str(mark))) + STOP,
-        "torch.jit": call(g("torch.jit", "load"), s(str(mark))) + STOP,
         # packages with names like the inert ones
         "chumpyx": call(g("chumpyx", "system"), *run) + STOP,
         "scipy": call(g("scipy", "LowLevelCallable"), *run) + STOP,
-        "scipy.sparsetools": call(g("scipy.sparsetools", "x"), *run) + STOP,
         # reader's own names as values
         "a function as value": RECONSTRUCT + STOP,
         "a function in a set": call(g("builtins", "set"), b"](" + RECONSTRUCT + b"e") + STOP,
@@ -350,46 +313,25 @@ def bombs() -> dict[str, bytes]:
     """Small pickles that would take for ever, or all memory, or the C stack."""
     laughs = nested_pairs(LEVELS)
     megabyte = s("a" * 10**6) + put(1)
-    many = b"](" + b"N" * 10**5 + b"e" + put(1)
     zeros = b(bytes(10**6)) + put(1)
-    encode, set_of, f8 = g("_codecs", "encode"), g("builtins", "set"), dtype("u1") + put(3)
+    encode, f8 = g("_codecs", "encode"), dtype("u1") + put(3)
     n = 20_000
     return {
         "tuples": laughs + STOP,
         "lists": nested_pairs(LEVELS, "list") + STOP,
         "tuples in a list": b"](" + laughs + b"e" + STOP,
-        "tuples as a key by SETITEM": b"}" + laughs + b"Ns" + STOP,
-        "tuples as a key by SETITEMS": b"}(" + laughs + b"Nu" + STOP,
-        "tuples as a key by DICT": b"(" + laughs + b"Nd" + STOP,
-        "tuples in a set": b"\x80\x04\x8f(" + laughs + b"\x90" + STOP,
-        "tuples in a frozenset": b"\x80\x04(" + laughs + b"\x91" + STOP,
-        "tuples in a called set": call(set_of, b"](" + laughs + b"e") + STOP,
-        "tuples in an ordered dictionary": call(g("collections", "OrderedDict"), b"](" + laughs + b"N\x86e") + STOP,
         "tuples as a shape": laughs + KEY[0] + array(KEY[1], dtype("f8"), b(b"")) + STOP,
-        "tuples as an encoding": laughs + KEY[0] + call(encode, s("a"), KEY[1]) + STOP,
         "tuples as a dtype": laughs + KEY[0] + call(DTYPE, KEY[1]) + STOP,
         "tuples as array data": laughs + KEY[0] + array(b"K\x01\x85", dtype("O8"), b"](" + KEY[1] + b"e") + STOP,
         "tuples as attributes": call(g("chumpy", "Ch")) + b"}" + s("x") + laughs + b"sb" + STOP,
         "tuples as a state": laughs + KEY[0] + call(g("chumpy", "Ch")) + KEY[1] + b"b" + KEY[1] + b"\x86" + STOP,
         "a deep tuple": b")" + b"\x85" * 150_000 + STOP,
-        "a deep tuple as key": b")" + b"\x85" * 150_000 + put(0) + b"}" + get(0) + b"Ns" + STOP,
         "a deep list": b"]" * 150_000 + b"a" * 149_999 + STOP,
         "deep foreign objects": b"".join(
             (call(g("chumpy", "Ch")), (b"}" + s("x") + call(g("chumpy", "Ch"))) * 5000, b"sb" * 5000)
         )
         + STOP,
         "copies of a text": megabyte + encode + put(2) + b"](" + (get(2) + get(1) + b"\x85R") * n + b"e" + STOP,
-        "copies of a list": many + set_of + put(2) + b"](" + (get(2) + get(1) + b"\x85R") * n + b"e" + STOP,
-        "copies of arguments": b"("
-        + b"N" * 10**4
-        + b"t"
-        + put(1)
-        + g("chumpy", "Ch")
-        + put(2)
-        + b"]("
-        + (get(2) + get(1) + b"R0") * n
-        + b"e"
-        + STOP,
         "copies of array data": zeros
         + EMPTY_ARRAY[:0]
         + f8
@@ -402,17 +344,6 @@ def bombs() -> dict[str, bytes]:
         * 2000
         + b"e"
         + STOP,
-        "copies of attributes": b"}("
-        + b"".join(s(str(k)) + b"N" for k in range(10**4))
-        + b"u"
-        + put(1)
-        + g("chumpy", "Ch")
-        + put(2)
-        + b"]("
-        + (get(2) + b")R" + get(1) + b"b") * n
-        + b"e"
-        + STOP,
-        "many classes": b"](" + b"".join(g("chumpy", str(k)) + b")R" for k in range(5000)) + b"e" + STOP,
         "BINBYTES8": b"\x80\x04\x8e" + struct.pack("<Q", 2**60) + b"abc" + STOP,
         "BINUNICODE8": b"\x80\x04\x8d" + struct.pack("<Q", 2**60) + b"abc" + STOP,
         "BYTEARRAY8": b"\x80\x05\x96" + struct.pack("<Q", 2**60) + b"abc" + STOP,
@@ -426,10 +357,6 @@ def bombs() -> dict[str, bytes]:
         "a shape of objects": array(integer(2**40) + b"\x85", dtype("O8"), b"]") + STOP,
         "a shape of nothing": array(integer(2**40) + b"\x85", dtype("S0"), b(b"")) + STOP,
         "a shape of empty texts": array(integer(2**33) + b"\x85", dtype("U0"), b(b"")) + STOP,
-        "a shape of huge numbers": integer(2 ** (8 * 10**5))
-        + put(1)
-        + array(b"(" + get(1) * 10**5 + b"t", dtype("f8"), b(b""))
-        + STOP,
         "a shape of 100 dimensions": array(b"(" + b"K\x01" * 100 + b"t", dtype("f8"), b(bytes(8))) + STOP,
         "a negative shape": array(integer(-1) + b"\x85", dtype("f8"), b(bytes(8))) + STOP,
         "a shape that is none": array(s("(1,)"), dtype("f8"), b(bytes(8))) + STOP,
@@ -635,26 +562,3 @@ def test_a_structured_array_of_numbers_is_plain_data(tmp_path):
     table = np.array([(1, 2.5), (3, 4.5)], [("a", "<i4"), ("b", "<f8")])
     np.save(tmp_path / "table.npy", table)
     np.testing.assert_array_equal(load_npy(tmp_path / "table.npy"), table)
-
-
-def test_the_worst_ones_within_a_gigabyte(tmp_path):
-    """In a process of their own, since a crash of the C stack would end this one."""
-    names = ["a deep tuple as key", "a deep tuple", "tuples as a key by SETITEM", "copies of array data"]
-    files = [tmp_path / f"{k}.pkl" for k in range(len(names))]
-    for file, name in zip(files, names, strict=True):
-        file.write_bytes(bombs()[name])
-    code = f"""
-        import resource, sys
-        from ihbench.errors import BadInput
-        from ihbench.files.safe_pickle import load_pickle
-        resource.setrlimit(resource.RLIMIT_AS, ({2**30}, {2**30}))
-        for file in sys.argv[1:]:
-            try:
-                load_pickle(file)
-            except BadInput:
-                print("refused")
-    """
-    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
-    command = [sys.executable, "-c", textwrap.dedent(code), *map(str, files)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment, check=False)
-    assert (done.returncode, done.stdout.split()) == (0, ["refused"] * len(names)), done.stderr[-500:]

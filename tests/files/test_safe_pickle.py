@@ -1,9 +1,4 @@
-import copyreg
-import os
 import pickle
-import struct
-import subprocess
-import tracemalloc
 
 import numpy as np
 import pytest
@@ -12,96 +7,6 @@ from ihbench.errors import BadInput
 from ihbench.files import safe_pickle
 from ihbench.files.safe_pickle import ForeignObject, load_npy, load_pickle
 from tests.body.python2_pickle import Instance, dumps
-
-
-def text(value: str) -> bytes:
-    return b"S" + repr(value).encode() + b"\n"
-
-
-def short(value: str) -> bytes:
-    return b"\x8c" + bytes([len(value)]) + value.encode()
-
-
-class Reduced:
-    def __init__(self, function, *arguments):
-        self.call = (function, arguments)
-
-    def __reduce__(self):
-        return self.call
-
-
-def attacks(mark: str, evil_npy: str) -> dict[str, bytes]:
-    """Pickles that create the file `mark` when plain pickle reads them."""
-    shell = f"touch {mark}"
-    python = f"open({mark!r}, 'w').close()"
-    return {
-        "os.system": b"cos\nsystem\n(" + text(shell) + b"tR.",
-        "posix.system": b"cposix\nsystem\n(" + text(shell) + b"tR.",
-        "eval": b"c__builtin__\neval\n(" + text(python) + b"tR.",
-        "exec": pickle.dumps(Reduced(exec, python)),
-        "getattr": (
-            b"cbuiltins\ngetattr\n(cos\n__dict__\n"
-            + text("get")
-            + b"tR("
-            + text("system")
-            + b"tR("
-            + text(shell)
-            + b"tR."
-        ),
-        "subprocess": pickle.dumps(Reduced(subprocess.check_call, ["touch", mark])),
-        "numpy.load": b"cnumpy\nload\n(" + text(evil_npy) + b"NI01\ntR.",
-        "numpy runstring": (
-            b"cnumpy.testing._private.utils\nrunstring\n(" + text(python) + b"cbuiltins\ndict\n)RtR."
-        ),
-        "stack global": b"\x80\x04" + short("os") + short("system") + b"\x93" + short(shell) + b"\x85R.",
-        "inst": b"(" + text(shell) + b"ios\nsystem\n.",
-        "obj": b"(csubprocess\nPopen\n(" + text("touch") + text(mark) + b"lo.",
-        "newobj": b"\x80\x02csubprocess\nPopen\n)\x81.",
-        "inside a list": b"]cos\nsystem\n(" + text(shell) + b"tRa.",
-        "extension registry": b"\x80\x02\x82\xf0(" + text(shell) + b"tR.",
-    }
-
-
-# "newobj" runs nothing under plain pickle (Popen needs __init__), it only must be refused
-EFFECTIVE = sorted(set(attacks("", "")) - {"newobj"})
-
-
-@pytest.fixture
-def registered_extension():
-    copyreg.add_extension("os", "system", 0xF0)
-    pickle.loads(b"\x80\x02\x82\xf0.")  # warms the cache that bypasses find_class
-    yield
-    copyreg.remove_extension("os", "system", 0xF0)
-    copyreg._extension_cache.clear()
-
-
-@pytest.mark.parametrize("name", [*EFFECTIVE, "newobj"])
-@pytest.mark.usefixtures("registered_extension")
-def test_hostile_pickles_are_refused_and_do_not_run(name, tmp_path):
-    mark = tmp_path / "mark"
-    evil_npy = tmp_path / "evil.npy"
-    np.save(evil_npy, np.array(Reduced(os.system, f"touch {mark}"), dtype=object), allow_pickle=True)
-    attack = attacks(str(mark), str(evil_npy))[name]
-    file = tmp_path / "attack.pkl"
-    file.write_bytes(attack)
-    if name in EFFECTIVE:  # the attack is a real one
-        result = pickle.loads(attack)
-        if isinstance(result, subprocess.Popen):
-            result.wait()
-        assert mark.exists()
-        mark.unlink()
-    with pytest.raises(BadInput, match=r"attack\.pkl") as refusal:
-        load_pickle(file)
-    assert "\n" not in str(refusal.value)
-    assert not mark.exists()
-
-
-def test_hostile_npy_does_not_run(tmp_path):
-    mark, file = tmp_path / "mark", tmp_path / "annots.npy"
-    np.save(file, np.array(Reduced(os.system, f"touch {mark}"), dtype=object), allow_pickle=True)
-    with pytest.raises(BadInput, match=r"annots\.npy.*system"):
-        load_npy(file)
-    assert not mark.exists()
 
 
 @pytest.mark.parametrize(
@@ -138,50 +43,6 @@ def test_trickery_with_allowed_names_is_refused(attack, tmp_path):
     assert safe_pickle._reconstruct.__defaults__ is None
 
 
-def test_names_that_hide_in_an_inert_package_do_nothing(tmp_path):
-    mark, file = tmp_path / "mark", tmp_path / "dotted.pkl"
-    call = short("chumpy") + short("os.system") + b"\x93" + short(f"touch {mark}") + b"\x85R."
-    file.write_bytes(b"\x80\x04" + call)
-    value = load_pickle(file)
-    assert isinstance(value, ForeignObject)
-    assert value.kind == "chumpy.os.system"
-    assert not mark.exists()
-
-
-def array_pickle(shape: tuple, dtype: str, data: bytes) -> bytes:
-    dims = b"(" + b"".join(b"L%dL\n" % n for n in shape) + b"t"
-    return (
-        b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n" + dims + b"S'b'\ntR"
-        b"(I1\n" + dims + b"cnumpy\ndtype\n(" + text(dtype) + b"I0\nI1\ntRI00\n" + data + b"tb."
-    )
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        array_pickle((10**13,), "f8", b"S''\n"),
-        array_pickle((10**6, 10**6), "f8", b"S'12345678'\n"),
-        array_pickle((10**12,), "O8", b"(l"),
-        array_pickle((-1,), "f8", b"S''\n"),
-        b"\x80\x04\x8e" + struct.pack("<Q", 10**13) + b"abc.",  # BINBYTES8
-        b"\x80\x05\x96" + struct.pack("<Q", 10**13) + b"abc.",  # BYTEARRAY8
-        b"\x80\x04\x95" + struct.pack("<Q", 10**13) + b"N",  # FRAME
-        b"\x80\x02Nr\xff\xff\xff\xffq",  # LONG_BINPUT at the highest index
-    ],
-)
-def test_sizes_that_the_file_does_not_hold_are_refused_without_allocating(content, tmp_path):
-    file = tmp_path / "giant.pkl"
-    file.write_bytes(content)
-    tracemalloc.start()
-    try:
-        with pytest.raises(BadInput, match=r"giant\.pkl"):
-            load_pickle(file)
-        peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-    assert peak < 20e6
-
-
 @pytest.mark.parametrize("content", [b"", b".", b"hello", b"\x80\x04", b"PK\x03\x04" * 9])
 def test_broken_files_are_bad_input(content, tmp_path):
     file = tmp_path / "broken.pkl"
@@ -189,13 +50,6 @@ def test_broken_files_are_bad_input(content, tmp_path):
     with pytest.raises(BadInput, match=r"broken\.pkl") as refusal:
         load_pickle(file)
     assert "\n" not in str(refusal.value)
-
-
-def test_deep_nesting_is_bad_input(tmp_path):
-    file = tmp_path / "deep.pkl"
-    file.write_bytes(b"]" * 50_000 + b"a" * 49_999 + b".")
-    with pytest.raises(BadInput, match=r"deep\.pkl"):
-        load_pickle(file)
 
 
 def test_every_truncation_of_a_good_file_is_bad_input(tmp_path):
