@@ -16,8 +16,8 @@ PEOPLE_SNAPSHOT = LayoutChoice(
     "people_snapshot",
     (
         "ihbench.datasets.people_snapshot.original:PeopleSnapshotRaw",
-        "ihbench.datasets.people_snapshot.instantavatar:InstantAvatar",
-        "ihbench.datasets.people_snapshot.gaussianavatar:GaussianAvatar",
+        "ihbench.datasets.people_snapshot.instantavatar:InstantAvatarFolder",
+        "ihbench.datasets.people_snapshot.gaussianavatar:GaussianAvatarFolder",
     ),
 )
 OCMOTION = LayoutChoice(

@@ -22,7 +22,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path, PurePosixPath
-from typing import Any, Protocol
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,16 +32,17 @@ from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera, off_orthogonal
 from ihbench.datasets.reading.capture_folder import BY_OPTIONS, CaptureFolder
 from ihbench.datasets.reading.pickles import write_pickle
-from ihbench.datasets.reading.plausibility import Outline, examine
+from ihbench.datasets.reading.subject_folders import SubjectFolders, View, count_files
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.paths import user_path
 from ihbench.files.pictures import encoded, read_mask, read_rgb, size_of
 from ihbench.files.safe_pickle import load_pickle
-from ihbench.files.spelling import missing_file
 from ihbench.registry import nearest
+from ihbench.scene.copy_report import SubjectReport
 
 Array = NDArray[np.float64]
+OneCapture = TypeVar("OneCapture", bound="OneCameraCapture")
 
 SPLITS = ("train", "test")
 SILHOUETTES = ("visible", "mask")  # two names of one thing
@@ -57,7 +58,6 @@ class OneCameraCapture(CaptureFolder):
 
     dataset = "ocmotion"
     visible_masks = True
-    variant: str
     frame_names: tuple[str, ...]
     _K: Array  # [3, 3] px, OpenCV's
     _E: Array  # [4, 4] world to camera, m
@@ -81,22 +81,15 @@ class OneCameraCapture(CaptureFolder):
     def image(self, camera: int, frame: int) -> NDArray[np.uint8]:
         """[H, W, 3] RGB, as stored."""
         path = self.image_path(camera, frame)
-        if not path.is_file():
-            raise missing_file(path, f"expected the image of frame {frame}{self.standin_hint}")
-        image = read_rgb(path)
-        self._check_size(path, image)
-        return image
+        return self.read_picture(path, camera, read_rgb, f"expected the image of frame {frame}")
 
     def silhouette(self, camera: int, frame: int, source: str = "mask") -> NDArray[np.bool_]:
         """[H, W] the visible person: what furniture hides is False. `source` is "visible" or, the same, "mask"."""
         if source not in SILHOUETTES:
             raise BadInput(f"silhouette source {source!r}: {nearest(source, list(SILHOUETTES))}")
         path = self.mask_path(camera, frame)
-        if not path.is_file():
-            raise missing_file(path, f"{self._mask_hint}{self.standin_hint}")
-        mask = read_mask(path, "first channel")  # OccFusion reads a palette's red
-        self._check_size(path, mask)
-        return mask
+        # OccFusion reads a palette's red
+        return self.read_picture(path, camera, lambda path: read_mask(path, "first channel"), self._mask_hint)
 
     def content_digest(self, camera: int, frame: int, source: str = "mask") -> bytes:
         """Hash of the bytes of a frame's image and mask file; a missing or unreadable one counts as empty."""
@@ -125,9 +118,12 @@ class OneCameraCapture(CaptureFolder):
 
     _mask_hint = "expected the visible mask, non-zero where the person is seen"
 
+    def image_size(self, camera: int) -> tuple[int, int]:
+        """(width, height) px, as annotated, else of the first image on disk."""
+        return self._image_size
+
     @cached_property
     def _image_size(self) -> tuple[int, int]:
-        """(width, height) px, as annotated, else of the first image on disk."""
         if self._annotated_size is not None:
             return self._annotated_size
         path = next((path for path in self._images if path.is_file()), None)
@@ -135,19 +131,36 @@ class OneCameraCapture(CaptureFolder):
             raise BadInput(f"{self._images[0].parent}: no image in it; expected the frames{self.standin_hint}")
         return size_of(path)
 
-    def _check_size(self, path: Path, picture: NDArray) -> None:
-        width, height = self._image_size
-        if picture.shape[:2] != (height, width):
-            raise BadInput(
-                f"{path}: {picture.shape[1]}×{picture.shape[0]} px, but the camera's images are {width}×{height} px; "
-                f"expected one size for all images and masks, as the calibration has it"
-            )
+
+class Sequences(SubjectFolders[OneCapture], Generic[OneCapture]):
+    """What the two layouts report of a sequence: its files, and the poses that cannot be used."""
+
+    dataset = "ocmotion"
+    whole = False  # furniture hides parts of the person
+
+    def inspect(self, capture: OneCapture, report: SubjectReport) -> list[View]:
+        frames = range(capture.n_frames)
+        images, masks = ({f: path(0, f) for f in frames} for path in (capture.image_path, capture.mask_path))
+        there = count_files(report, {"image": images, "mask": masks})
+        posed: set[int] = set()
+        unreadable = []
+        for frame in frames:
+            try:
+                capture.body_pose(frame)
+                posed.add(frame)
+            except BadInput as error:
+                unreadable.append(str(error))
+        for text in list(dict.fromkeys(unreadable))[:LISTED_PROBLEMS]:
+            report.problem(text)
+        if len(unreadable) > LISTED_PROBLEMS:
+            report.problem(f"and so on: the body's parameters are unusable at {len(unreadable)} frames")
+        return sorted((0, frame) for frame in there["image"] & there["mask"] & posed)
 
 
 # ---------------------------------------------------------------------------------- the original layout
 
 
-class OcMotionOriginal:
+class OcMotionOriginal(Sequences["OcMotionCapture"]):
     """The folder that holds `annot/train.pkl` or `annot/test.pkl`.
 
     A subject is one person before one camera, named after the folders of the images: "0011_02", and "0011_02_p1" for
@@ -155,43 +168,38 @@ class OcMotionOriginal:
     they are read once a process, when the first subject is asked for.
     """
 
+    layout = "original"
+
     def __init__(self, root: Path):
         """Raises `BadInput` when there is no annotation file; does not read them."""
         self.root = user_path(root)
         if not self.root.is_dir():
             raise BadInput(f"{self.root}: no such folder; give the folder that holds OcMotion's annot/")
-        self._annots = [path for path in (self.root / "annot" / f"{split}.pkl" for split in SPLITS) if path.is_file()]
-        if not self._annots:
+        if not self.holds(self.root):
             raise BadInput(f"{self.root}: no annot/train.pkl or annot/test.pkl in it{_where_else(self.root)}")
 
     @staticmethod
-    def check(root: Path, body: Body | None = None) -> dict[str, Any]:
-        """What this copy is and what it lacks; see `checked` below."""
-        return checked(OcMotionOriginal(root), body)
+    def holds(folder: Path) -> bool:
+        return any((folder / "annot" / f"{split}.pkl").is_file() for split in SPLITS)
 
     def subjects(self) -> list[str]:
         """Sorted names. Raises `BadInput` for annotations of another structure."""
         return sorted(self._subjects)
 
-    def open(self, subject: str, body: Body | None = None) -> OcMotionCapture:
-        """One person before one camera. `body` is the SMPL model its poses belong to.
-
-        Raises `BadInput` for an unknown subject and for annotations that are incomplete or change their camera.
-        """
-        if subject not in self._subjects:
-            raise BadInput(f"{self.root}: no subject {subject!r}: {nearest(subject, self.subjects())}")
+    def capture(self, subject: str, body: Body | None) -> OcMotionCapture:
         return OcMotionCapture(self.root, subject, self._subjects[subject], body)
 
     @cached_property
     def _subjects(self) -> dict[str, _Track]:
-        found: dict[str, _Track] = {}
-        for path in self._annots:
+        tracks: dict[str, _Track] = {}
+        paths = [path for path in (self.root / "annot" / f"{split}.pkl" for split in SPLITS) if path.is_file()]
+        for path in paths:
             file = path.stat()
             for name, track in _tracks(path, (file.st_ino, file.st_mtime_ns, file.st_size)).items():
-                found[f"{name}_{path.stem}" if name in found else name] = track
-        if not found:
-            raise BadInput(f"{self._annots[0]}: no person in any frame; expected the annotations of OcMotion")
-        return found
+                tracks[f"{name}_{path.stem}" if name in tracks else name] = track
+        if not tracks:
+            raise BadInput(f"{paths[0]}: no person in any frame; expected the annotations of OcMotion")
+        return tracks
 
 
 class OcMotionCapture(OneCameraCapture):
@@ -445,99 +453,6 @@ def described(value: object) -> str:
     if isinstance(value, np.ndarray):
         return f"a {value.dtype} array of shape {list(value.shape)}"
     return f"a {type(value).__name__}"
-
-
-# ----------------------------------------------------------------------------------------------- check
-
-
-class _Sequences(Protocol):
-    root: Path
-
-    def subjects(self) -> list[str]: ...
-
-    def open(self, subject: str, body: Body | None = None) -> OneCameraCapture: ...
-
-
-def check(root: Path, body: Body | None = None, samples: int = 3) -> dict[str, Any]:
-    """`checked` for the original layout. Raises `BadInput` when the root is not of this layout at all."""
-    return checked(OcMotionOriginal(root), body, samples)
-
-
-def checked(dataset: _Sequences, body: Body | None = None, samples: int = 3) -> dict[str, Any]:
-    """What a copy is and what it lacks, for `ihbench data check`.
-
-    Lists files, reads every pose, decodes `samples` frames a subject. `mask_on_body` is the share of the visible
-    masks that lies on the projected body, over the frames looked at: well below 0.9 means masks that are mirrored or
-    inverted, or wrong cameras, units or parameters. `vertices_in_mask` is for information, since furniture hides
-    vertices. Both need the body model: a stand-in has its own, real captures need `body`, the SMPL model.
-    """
-    try:
-        subjects = [_check_subject(dataset, name, samples, body) for name in dataset.subjects()]
-    except BadInput as error:  # annotations that cannot be read name no subject
-        subjects = [{"subject": "", "problems": [str(error)]}]
-    return {
-        "dataset": OneCameraCapture.dataset,
-        "layout": "original" if isinstance(dataset, OcMotionOriginal) else "w2a",
-        "root": str(dataset.root),
-        "standin": next((subject["standin"] for subject in subjects if subject.get("standin")), ""),
-        "subjects": subjects,
-        "ok": not any(subject["problems"] for subject in subjects),
-    }
-
-
-def _check_subject(dataset: _Sequences, name: str, samples: int, body: Body | None) -> dict[str, Any]:
-    problems: list[str] = []
-    found: dict[str, Any] = {"subject": name, "problems": problems, "warnings": []}
-    try:
-        capture = dataset.open(name)
-        model = capture.model if capture.standin else body
-    except BadInput as error:
-        problems.append(str(error))
-        return found
-    frames = range(capture.n_frames)
-    listed = _listing({path.parent for f in frames for path in (capture.image_path(0, f), capture.mask_path(0, f))})
-    there = {
-        "image": {frame for frame in frames if capture.image_path(0, frame) in listed},
-        "mask": {frame for frame in frames if capture.mask_path(0, frame) in listed},
-    }
-    missing = {kind: capture.n_frames - len(present) for kind, present in there.items()}
-    found |= {
-        "standin": capture.standin,
-        "body": capture.body,
-        "variant": capture.variant,
-        "cameras": 1,
-        "frames": capture.n_frames,
-        "files": {kind: len(present) for kind, present in there.items()},
-        "missing": missing,
-    }
-    if not capture.standin:
-        problems += [f"{n} of {what} missing" for what, n in missing.items() if n]
-    poses: dict[int, BodyPose] = {}
-    unreadable = []
-    for frame in frames:
-        try:
-            poses[frame] = capture.body_pose(frame)
-        except BadInput as error:
-            unreadable.append(str(error))
-    problems += list(dict.fromkeys(unreadable))[:LISTED_PROBLEMS]
-    if len(unreadable) > LISTED_PROBLEMS:
-        problems.append(f"and so on: the body's parameters are unusable at {len(unreadable)} frames")
-    complete = sorted(there["image"] & there["mask"])
-    if complete:
-
-        def outline(frame: int) -> Outline:
-            assert model is not None
-            return Outline(model.pose(capture.body_pose(frame)), model.faces)
-
-        views = [(0, frame) for frame in complete if frame in poses]
-        examine(capture, views, found, whole=False, outline=outline if model else None, samples=samples)
-    else:
-        problems.append("no image with its mask found")
-    return found
-
-
-def _listing(folders: set[Path]) -> set[Path]:
-    return {path for folder in folders if folder.is_dir() for path in folder.iterdir()}
 
 
 # ----------------------------------------------------------------------------------------------- write

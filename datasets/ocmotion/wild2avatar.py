@@ -29,8 +29,8 @@ from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.datasets.ocmotion.original import (
     OneCameraCapture,
+    Sequences,
     check_calibration,
-    checked,
     described,
     mask_png,
     metric_pose,
@@ -40,14 +40,14 @@ from ihbench.datasets.ocmotion.original import (
     ten_betas,
 )
 from ihbench.datasets.reading.pickles import write_pickle
+from ihbench.datasets.reading.subject_folders import View
 from ihbench.errors import BadInput
 from ihbench.files import atomic
-from ihbench.files.paths import user_path
 from ihbench.files.pictures import encoded, one_line
 from ihbench.files.regular import read_text
 from ihbench.files.safe_pickle import load_pickle
 from ihbench.files.spelling import missing_file
-from ihbench.registry import nearest
+from ihbench.scene.copy_report import SubjectReport
 
 Array = NDArray[np.float64]
 
@@ -58,38 +58,40 @@ NOT_SEQUENCES = ("truth",)  # what a stand-in keeps beside the sequences
 SAME_EXTRINSICS = 1e-3  # files keep float32, and fold the translation in at that precision
 
 
-class OcMotionW2a:
+class OcMotionW2a(Sequences["W2aCapture"]):
     """A folder that holds `*_w2a` sequence folders, or one of those folders itself."""
 
-    def __init__(self, root: Path):
-        """Raises `BadInput` when there is no such folder, or no sequence in it."""
-        self.root = user_path(root)
-        if not self.root.is_dir():
-            raise BadInput(f"{self.root}: no such folder; give the folder that holds the *{NAME_END} sequences")
-        if _is_sequence(self.root.absolute()):
-            self._folders = {self.root.absolute().name: self.root.absolute()}
-        else:
-            self._folders = {folder.name: folder for folder in self.root.iterdir() if _is_sequence(folder)}
-        if not self._folders:
-            raise BadInput(f"{self.root}: no sequence with images/ and {METADATA} in it{_where_else(self.root)}")
+    layout = "w2a"
+    content = f"*{NAME_END} sequences, with images/ and {METADATA}"
 
     @staticmethod
-    def check(root: Path, body: Body | None = None) -> dict[str, Any]:
-        """What this copy is and what it lacks; see `check` below."""
-        return check(root, body)
+    def holds(folder: Path) -> bool:
+        if folder.name in NOT_SEQUENCES or not folder.is_dir():
+            return False
+        named = folder.name.endswith(NAME_END) and not (folder / "annot").is_dir()
+        pictures = any((folder / name).is_dir() for name in ("images", "masks"))
+        return (named and pictures) or ((folder / METADATA).is_file() and (named or pictures))
 
-    def subjects(self) -> list[str]:
-        """The names of the sequence folders, sorted."""
-        return sorted(self._folders)
+    def other_layout(self) -> str:
+        original = any((self.root / "annot").glob("*.pkl"))
+        return "this looks like the original OcMotion release (annot/), " if original else ""
 
-    def open(self, subject: str, body: Body | None = None) -> W2aCapture:
-        """One sequence. Reads metadata.json and lists images/. `body` is the SMPL model the poses belong to.
-
-        Raises `BadInput` for an unknown subject, and for frames or cameras that are not as expected.
-        """
-        if subject not in self._folders:
-            raise BadInput(f"{self.root}: no subject {subject!r}: {nearest(subject, self.subjects())}")
+    def capture(self, subject: str, body: Body | None) -> W2aCapture:
         return W2aCapture(self._folders[subject], body)
+
+    def inspect(self, capture: W2aCapture, report: SubjectReport) -> list[View]:
+        """Entries of metadata.json outside the range of the images count as missing images, too."""
+        views = super().inspect(capture, report)
+        outside = len(capture._metadata) - capture.n_frames
+        if outside and not capture.standin:
+            report.missing["image"] += outside
+            report.warn(f"{METADATA} has {outside} frames before or after the images; they are not used")
+        if (capture.folder / "all_cameras.pkl").is_file() and report.files["image"]:
+            try:
+                capture.novel_cameras(0)
+            except BadInput as error:
+                report.problem(str(error))
+        return views
 
 
 class W2aCapture(OneCameraCapture):
@@ -156,7 +158,7 @@ class W2aCapture(OneCameraCapture):
                 )
         for one_K, one_E in zip(K, E, strict=True):
             check_calibration(one_K, one_E, where)
-        size = self._image_size
+        size = self.image_size(0)
         return [Camera.from_opencv(one_K, e[:3, :3], e[:3, 3], *size) for one_K, e in zip(K, E, strict=True)]
 
     def _where(self, name: str) -> str:
@@ -176,14 +178,6 @@ def _holds(E: Array, wanted: Array) -> bool:
     """Whether one of the extrinsics [N, 4, 4] is the wanted one [4, 4]."""
     scale = max(1.0, float(np.abs(wanted).max()))
     return bool((np.abs(E - wanted).max((1, 2)) < SAME_EXTRINSICS * scale).any())
-
-
-def _is_sequence(folder: Path) -> bool:
-    if folder.name in NOT_SEQUENCES or not folder.is_dir():
-        return False
-    named = folder.name.endswith(NAME_END) and not (folder / "annot").is_dir()
-    pictures = any((folder / name).is_dir() for name in ("images", "masks"))
-    return (named and pictures) or ((folder / METADATA).is_file() and (named or pictures))
 
 
 def camera_id(name: str) -> str:
@@ -262,46 +256,6 @@ def _read_frames(path: Path, names: Iterable[str]) -> dict[str, dict]:
         if not isinstance(content.get(name), dict):
             raise BadInput(f"{path}: expected a dictionary for frame {name}, found {described(content.get(name))}")
     return content
-
-
-def _where_else(root: Path) -> str:
-    below = next((path for path in sorted(root.glob(f"*/*{NAME_END}")) if _is_sequence(path)), None)
-    if below is not None:
-        return f"; there is one in {below.parent}, give that folder"
-    if any((root / "annot").glob("*.pkl")):
-        return f"; this looks like the original OcMotion release (annot/), expected *{NAME_END} sequences"
-    return f"; expected Wild2Avatar's OcMotion sequences, unpacked (*{NAME_END})"
-
-
-# ----------------------------------------------------------------------------------------------- check
-
-
-def check(root: Path, body: Body | None = None, samples: int = 3) -> dict[str, Any]:
-    """What this copy is and what it lacks, for `ihbench data check`; see `original.checked`.
-
-    Entries of metadata.json outside the range of the images are counted in missing["image"], too. Raises `BadInput`
-    when the root is not of this layout at all.
-    """
-    dataset = OcMotionW2a(root)
-    found = checked(dataset, body, samples)
-    for subject in found["subjects"]:
-        if "missing" not in subject:
-            continue
-        capture = dataset.open(subject["subject"])
-        problems: list[str] = subject["problems"]
-        outside = len(capture._metadata) - capture.n_frames
-        if outside and not capture.standin:
-            subject["missing"]["image"] += outside
-            subject["warnings"].append(
-                f"{METADATA} has {outside} frames before or after the images; they are not used"
-            )
-        if (capture.folder / "all_cameras.pkl").is_file() and subject["files"]["image"]:
-            try:
-                capture.novel_cameras(0)
-            except BadInput as error:
-                problems.append(str(error))
-    found["ok"] = not any(subject["problems"] for subject in found["subjects"])
-    return found
 
 
 # ----------------------------------------------------------------------------------------------- write

@@ -12,13 +12,11 @@ follow the images' names in sorted order.
 
 from __future__ import annotations
 
-import hashlib
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,25 +25,21 @@ from ihbench.body import Body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.datasets.people_snapshot.original import (
-    SnapshotFolder,
-    checked,
-    chosen_folder,
+    PeopleSnapshotRaw,
+    SnapshotPictures,
     finite_pose,
-    holds_raw,
     read_npz,
+    report_spoiled_rows,
     rigid_extrinsic,
-    sample_frames,
-    spelled_rows,
-    spoiled_rows,
     stacked,
-    subject_folders,
 )
+from ihbench.datasets.reading.subject_folders import SubjectFolders, View, count_files
 from ihbench.errors import BadInput
 from ihbench.files import atomic
-from ihbench.files.paths import user_path
-from ihbench.files.pictures import encoded, read_mask, read_rgb, size_of
+from ihbench.files.pictures import encoded, read_mask, size_of
 from ihbench.files.spelling import missing_file
 from ihbench.files.tensors import read_tensors
+from ihbench.scene.copy_report import SubjectReport
 
 SPLITS = ("train", "test")
 IMAGES, MASKS, CAMERA, POSES = "images", "masks", "cam_parms", "smpl_parms.pth"
@@ -53,29 +47,41 @@ PICTURES = (".png", ".jpg", ".jpeg")
 LARGEST_FRAME = 1_000_000  # stems above are no frame numbers (dates, …)
 
 
-class GaussianAvatar:
+class GaussianAvatarFolder(SubjectFolders["GaussianAvatarCapture"]):
     """A folder that holds subjects' folders of GaussianAvatar's layout, or one of those folders itself."""
 
-    layout = "gaussianavatar"
-
-    def __init__(self, root: Path):
-        """Raises `BadInput` when there is no such folder, or nothing of this layout in it."""
-        self.root = user_path(root)
-        wanted = f"GaussianAvatar's layout (train/ and test/ with {IMAGES}/, {MASKS}/, {CAMERA}.npz, {POSES})"
-        self._folders = subject_folders(self.root, holds_gaussianavatar, wanted)
+    dataset, layout = "people_snapshot", "gaussianavatar"
+    content = f"GaussianAvatar's layout (train/ and test/ with {IMAGES}/, {MASKS}/, {CAMERA}.npz, {POSES})"
 
     @staticmethod
-    def check(root: Path, body: Body | None = None) -> dict[str, Any]:
-        """What this copy is and what it lacks; see `check` below."""
-        return check(root, body=body)
+    def holds(folder: Path) -> bool:
+        return not PeopleSnapshotRaw.holds(folder) and any(_holds_split(folder / split) for split in SPLITS)
 
-    def subjects(self) -> list[str]:
-        """Names of the folders, sorted."""
-        return sorted(self._folders)
+    def capture(self, subject: str, body: Body | None) -> GaussianAvatarCapture:
+        return GaussianAvatarCapture(self._folders[subject], body)
 
-    def open(self, subject: str, body: Body | None = None) -> GaussianAvatarCapture:
-        """One subject. Lists its images only. Raises `BadInput` for an unknown subject or one without images."""
-        return GaussianAvatarCapture(chosen_folder(self.root, self._folders, subject), body)
+    def inspect(self, capture: GaussianAvatarCapture, report: SubjectReport) -> list[View]:
+        report.gender, report.numbered = capture.gender, capture.numbered
+        paths = {"image": capture.image_path, "mask": capture.mask_path}
+        there = count_files(report, {kind: {f: of(f) for f in capture.frames} for kind, of in paths.items()})
+        counts = {split: sum(capture.split_of(frame) == split for frame in capture.frames) for split in SPLITS}
+        report.files |= counts
+        report.missing = {"mask": len(capture.frames) - len(there["mask"])}
+        for split, count in counts.items():
+            if not count:
+                report.problem(f"no image in {split}/{IMAGES}")
+                continue
+            path = capture.folder / split / POSES
+            try:
+                pose, trans, beta = capture._poses(split)
+            except BadInput as error:
+                report.problem(str(error))
+                continue
+            if not np.isfinite(beta).all():
+                report.problem(f"{path}: NaN or infinity in 'beta'")
+            else:
+                report_spoiled_rows(report, path, pose, trans)
+        return [(0, frame) for frame in sorted(there["mask"])]
 
 
 @dataclass(frozen=True)
@@ -87,7 +93,7 @@ class Stored:
     image: Path
 
 
-class GaussianAvatarCapture(SnapshotFolder):
+class GaussianAvatarCapture(SnapshotPictures):
     """One subject, read lazily; see `scene.contracts.Capture`. Keeps no images.
 
     Frames are numbered as the images are named when all names are numbers and none occurs twice, else consecutively:
@@ -151,41 +157,16 @@ class GaussianAvatarCapture(SnapshotFolder):
         entry = self._where(frame)
         return finite_pose(self.folder / entry.split / POSES, entry.row, *self._poses(entry.split))
 
-    def image(self, camera: int, frame: int) -> NDArray[np.uint8]:
-        """[H, W, 3] RGB, as stored."""
-        self.check_index(camera, frame)
-        path = self._where(frame).image
-        image = read_rgb(path)
-        self.check_size(path, image, self._camera)
-        return image
-
-    def silhouette(self, camera: int, frame: int, source: str = "mask") -> NDArray[np.bool_]:
-        """[H, W]. `source` is "mask"."""
-        self.check_index(camera, frame)
-        self.check_source(source)
-        path = self.mask_path(frame)
-        if not path.is_file():
-            raise missing_file(path, f"expected the mask of frame {frame}{self.standin_hint}")
-        mask = read_mask(path, "half")
-        self.check_size(path, mask, self._camera)
-        return mask
-
-    def content_digest(self, camera: int, frame: int, source: str = "mask") -> bytes:
-        """Hash of the bytes of the frame's image and mask files; a missing file counts as empty."""
-        self.check_index(camera, frame)
-        digest = hashlib.sha256()
-        if frame in self._stored:
-            for path in (self._stored[frame].image, self.mask_path(frame)):
-                data = path.read_bytes() if path.is_file() else b""
-                digest.update(len(data).to_bytes(8, "little") + data)
-        return digest.digest()
-
-    def files_of(self, camera: int, frame: int, source: str) -> tuple[Path, ...]:
-        return self._where(frame).image, self.mask_path(frame)
+    def image_path(self, frame: int) -> Path:
+        return self._where(frame).image
 
     def mask_path(self, frame: int) -> Path:
         entry = self._where(frame)
         return self.folder / entry.split / MASKS / f"{entry.image.stem}.png"
+
+    @staticmethod
+    def read_mask(path: Path) -> NDArray[np.bool_]:
+        return read_mask(path, "half")
 
     def camera_path(self, frame: int) -> Path:
         """cam_parms.npz of the frame's split, else the image's own file in cam_parms/."""
@@ -215,11 +196,6 @@ class GaussianAvatarCapture(SnapshotFolder):
                 )
             self._rows[split] = rows
         return self._rows[split]
-
-
-def holds_gaussianavatar(folder: Path) -> bool:
-    """Whether a folder is a subject of this layout, perhaps with one kind of file missing."""
-    return not holds_raw(folder) and any(_holds_split(folder / split) for split in SPLITS)
 
 
 def _holds_split(folder: Path) -> bool:
@@ -262,39 +238,6 @@ def read_poses(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], ND
     if len(pose) != len(trans):
         raise BadInput(f"{path}: expected one 'trans' for each 'body_pose', found {len(trans)} and {len(pose)}")
     return pose, trans, beta
-
-
-# ----------------------------------------------------------------------------------------------- check
-
-
-def check(root: Path, samples: int = 3, body: Body | None = None) -> dict[str, Any]:
-    """What this copy is and what it lacks, for `ihbench data check`; see `people_snapshot.check`."""
-    return checked(GaussianAvatar(root), body, lambda capture, found: _inspect(capture, samples, found))
-
-
-def _inspect(capture: GaussianAvatarCapture, samples: int, found: dict[str, Any]) -> None:
-    problems = found["problems"]
-    frames = capture.frames
-    masked = [frame for frame in frames if capture.mask_path(frame).is_file()]
-    found["files"] = {"image": len(frames), "mask": len(masked)}
-    found["missing"] = {"mask": len(frames) - len(masked)}
-    found["numbered"] = capture.numbered
-    if len(masked) < len(frames):
-        problems.append(f"{len(frames) - len(masked)} of mask missing")
-    for split in SPLITS:
-        found["files"][split] = sum(capture.split_of(frame) == split for frame in frames)
-        if not found["files"][split]:
-            problems.append(f"no image in {split}/{IMAGES}")
-            continue
-        try:
-            pose, trans, beta = capture._poses(split)
-            if not np.isfinite(beta).all():
-                problems.append(f"{capture.folder / split / POSES}: NaN or infinity in 'beta'")
-            elif rows := spoiled_rows(pose, trans):
-                problems.append(spelled_rows(capture.folder / split / POSES, rows))
-        except BadInput as error:
-            problems.append(str(error))
-    sample_frames(capture, masked, samples, found)
 
 
 # ----------------------------------------------------------------------------------------------- write

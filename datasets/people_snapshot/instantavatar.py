@@ -13,7 +13,6 @@ InstantAvatar uses the subject's name tells. Files written here say it, in `fram
 
 from __future__ import annotations
 
-import hashlib
 import io
 import re
 from collections.abc import Sequence
@@ -26,27 +25,22 @@ from numpy.typing import NDArray
 from ihbench.body import Body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
-from ihbench.datasets.people_snapshot.gaussianavatar import holds_gaussianavatar
+from ihbench.datasets.people_snapshot.gaussianavatar import GaussianAvatarFolder
 from ihbench.datasets.people_snapshot.original import (
-    SnapshotFolder,
-    checked,
-    chosen_folder,
+    PeopleSnapshotRaw,
+    SnapshotPictures,
     finite_pose,
-    holds_raw,
     read_npz,
+    report_spoiled_rows,
     rigid_extrinsic,
-    sample_frames,
-    spelled_rows,
-    spoiled_rows,
     stacked,
-    subject_folders,
 )
+from ihbench.datasets.reading.subject_folders import SubjectFolders, View, count_files
 from ihbench.errors import BadInput
 from ihbench.files import atomic
-from ihbench.files.paths import user_path
-from ihbench.files.pictures import above_half, encoded, read_rgb
+from ihbench.files.pictures import above_half, encoded
 from ihbench.files.safe_pickle import load_npy
-from ihbench.files.spelling import missing_file
+from ihbench.scene.copy_report import SubjectReport
 
 CAMERA_FILE, POSES_FILE = "cameras.npz", "poses.npz"
 REFINED = {"train": "poses/anim_nerf_train.npz", "test": "poses/anim_nerf_test.npz"}
@@ -60,33 +54,42 @@ OFFICIAL_FRAMES = {
 }
 
 
-class InstantAvatar:
+class InstantAvatarFolder(SubjectFolders["InstantAvatarCapture"]):
     """A folder that holds subjects' folders of InstantAvatar's layout, or one of those folders itself."""
 
-    layout = "instantavatar"
-
-    def __init__(self, root: Path):
-        """Raises `BadInput` when there is no such folder, or nothing of this layout in it."""
-        self.root = user_path(root)
-        wanted = f"InstantAvatar's layout (images/image_0000.png, masks/, {CAMERA_FILE}, {POSES_FILE})"
-        self._folders = subject_folders(self.root, holds_instantavatar, wanted)
+    dataset, layout = "people_snapshot", "instantavatar"
+    content = f"InstantAvatar's layout (images/image_0000.png, masks/, {CAMERA_FILE}, {POSES_FILE})"
 
     @staticmethod
-    def check(root: Path, body: Body | None = None) -> dict[str, Any]:
-        """What this copy is and what it lacks; see `check` below."""
-        return check(root, body=body)
+    def holds(folder: Path) -> bool:
+        """GaussianAvatar's copies, made beside cameras.npz and images/ of their source, are GaussianAvatar's."""
+        parts = (folder / CAMERA_FILE).is_file(), (folder / POSES_FILE).is_file()
+        if not any(parts) or PeopleSnapshotRaw.holds(folder) or GaussianAvatarFolder.holds(folder):
+            return False
+        return all(parts) or any((folder / "images").glob("image_*.png"))
 
-    def subjects(self) -> list[str]:
-        """Names of the folders, sorted."""
-        return sorted(self._folders)
+    def capture(self, subject: str, body: Body | None) -> InstantAvatarCapture:
+        return InstantAvatarCapture(self._folders[subject], body)
 
-    def open(self, subject: str, body: Body | None = None) -> InstantAvatarCapture:
-        """One subject. Reads cameras and poses, and lists the images. Raises `BadInput` for an unknown subject or a
-        damaged one."""
-        return InstantAvatarCapture(chosen_folder(self.root, self._folders, subject), body)
+    def inspect(self, capture: InstantAvatarCapture, report: SubjectReport) -> list[View]:
+        report.gender = capture.gender
+        n_poses = len(capture._poses[0])
+        paths = {"image": capture.image_path, "mask": capture.mask_path}
+        frames = range(capture.n_frames)
+        there = count_files(report, {kind: {f: path_of(f) for f in frames} for kind, path_of in paths.items()})
+        refined = {f"anim_nerf_{split}": len(rows[0]) for split, rows in capture.refined.items()}
+        report.files |= {"poses": n_poses, **refined}
+        if surplus := sum(frame >= n_poses for frame in capture.images):
+            report.warn(f"{surplus} images have no pose in {POSES_FILE} and are not used")
+        if not capture.standin and (surplus := n_poses - capture.n_frames) > 0:
+            report.warn(f"{surplus} poses after the last image are not used")
+        report_spoiled_rows(report, capture.folder / POSES_FILE, *capture._poses[:2])
+        for split, rows in capture.refined.items():
+            report_spoiled_rows(report, capture.folder / REFINED[split], *rows[1:3])
+        return [(0, frame) for frame in sorted(there["image"] & there["mask"])]
 
 
-class InstantAvatarCapture(SnapshotFolder):
+class InstantAvatarCapture(SnapshotPictures):
     """One subject, read lazily; see `scene.contracts.Capture`. Keeps no images.
 
     There are as many frames as poses; images that real data lack at the end shorten it.
@@ -132,55 +135,15 @@ class InstantAvatarCapture(SnapshotFolder):
         split, row = self._row_of[frame]
         return finite_pose(self.folder / REFINED[split], row, *self.refined[split][1:])
 
-    def image(self, camera: int, frame: int) -> NDArray[np.uint8]:
-        """[H, W, 3] RGB, as stored."""
-        self.check_index(camera, frame)
-        path = self.image_path(frame)
-        if not path.is_file():
-            raise missing_file(path, f"expected the image of frame {frame}{self.standin_hint}")
-        image = read_rgb(path)
-        self.check_size(path, image, self._camera)
-        return image
-
-    def silhouette(self, camera: int, frame: int, source: str = "mask") -> NDArray[np.bool_]:
-        """[H, W], True where the stored mask is above one half. `source` is "mask"."""
-        self.check_index(camera, frame)
-        self.check_source(source)
-        path = self.mask_path(frame)
-        if not path.is_file():
-            raise missing_file(path, f"expected the mask of frame {frame}{self.standin_hint}")
-        mask = read_mask(path)
-        self.check_size(path, mask, self._camera)
-        return mask
-
-    def content_digest(self, camera: int, frame: int, source: str = "mask") -> bytes:
-        """Hash of the bytes of the frame's image and mask files; a missing file counts as empty."""
-        self.check_index(camera, frame)
-        digest = hashlib.sha256()
-        for path in (self.image_path(frame), self.mask_path(frame)):
-            data = path.read_bytes() if path.is_file() else b""
-            digest.update(len(data).to_bytes(8, "little") + data)
-        return digest.digest()
-
-    def files_of(self, camera: int, frame: int, source: str) -> tuple[Path, ...]:
-        return self.image_path(frame), self.mask_path(frame)
-
     def image_path(self, frame: int) -> Path:
         return self.folder / "images" / f"image_{frame:04d}.png"
 
     def mask_path(self, frame: int) -> Path:
         return self.folder / "masks" / f"mask_{frame:04d}.npy"
 
-
-def holds_instantavatar(folder: Path) -> bool:
-    """Whether a folder is a subject of this layout, perhaps with one of its files missing.
-
-    GaussianAvatar's copies are made beside cameras.npz and images/ of their source; those count as GaussianAvatar's.
-    """
-    parts = (folder / CAMERA_FILE).is_file(), (folder / POSES_FILE).is_file()
-    if not any(parts) or holds_raw(folder) or holds_gaussianavatar(folder):
-        return False
-    return all(parts) or any((folder / "images").glob("image_*.png"))
+    @staticmethod
+    def read_mask(path: Path) -> NDArray[np.bool_]:
+        return read_mask(path)
 
 
 def _numbered_images(folder: Path) -> list[int]:
@@ -279,40 +242,6 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
         raise BadInput(f"{path}: expected 0 to 1, or 0 to 255, found {lowest:g} to {highest:g}")
     # a soft mask of 0 to 1 may overshoot a little where it was resampled
     return above_half(mask, 1 if highest <= 1.5 else 255)
-
-
-# ----------------------------------------------------------------------------------------------- check
-
-
-def check(root: Path, samples: int = 3, body: Body | None = None) -> dict[str, Any]:
-    """What this copy is and what it lacks, for `ihbench data check`; see `people_snapshot.check`."""
-    return checked(InstantAvatar(root), body, lambda capture, found: _inspect(capture, samples, found))
-
-
-def _inspect(capture: InstantAvatarCapture, samples: int, found: dict[str, Any]) -> None:
-    problems = found["problems"]
-    images = [frame for frame in capture.images if frame < capture.n_frames]
-    masked = [frame for frame in images if capture.mask_path(frame).is_file()]
-    n_masks = sum(capture.mask_path(frame).is_file() for frame in range(capture.n_frames))
-    found["files"] = {"image": len(images), "mask": n_masks, "poses": len(capture._poses[0])}
-    found["files"] |= {f"anim_nerf_{split}": len(refined[0]) for split, refined in capture.refined.items()}
-    found["missing"] = {"image": capture.n_frames - len(images), "mask": capture.n_frames - n_masks}
-    if not capture.standin:
-        problems += [f"{n} of {what} missing" for what, n in found["missing"].items() if n]
-    if surplus := sum(frame >= len(capture._poses[0]) for frame in capture.images):
-        found["warnings"].append(f"{surplus} images have no pose in {POSES_FILE} and are not used")
-    if not capture.standin and (surplus := len(capture._poses[0]) - capture.n_frames) > 0:
-        found["warnings"].append(f"{surplus} poses after the last image are not used")
-    for name, poses in (
-        (POSES_FILE, capture._poses[:2]),
-        *((REFINED[s], r[1:3]) for s, r in capture.refined.items()),
-    ):
-        if rows := spoiled_rows(*poses):
-            problems.append(spelled_rows(capture.folder / name, rows))
-    if masked:
-        sample_frames(capture, masked, samples, found)
-    else:
-        problems.append("no image with its mask found")
 
 
 # ----------------------------------------------------------------------------------------------- write

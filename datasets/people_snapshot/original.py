@@ -19,8 +19,9 @@ import hashlib
 import re
 import tempfile
 import threading
+from abc import abstractmethod
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,14 +35,15 @@ from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera, off_orthogonal
 from ihbench.datasets.reading.capture_folder import BY_OPTIONS, CaptureFolder
 from ihbench.datasets.reading.pickles import write_pickle
-from ihbench.datasets.reading.plausibility import Outline, examine, share_inside
+from ihbench.datasets.reading.plausibility import share_inside
+from ihbench.datasets.reading.subject_folders import SubjectFolders, View
 from ihbench.errors import BadInput
 from ihbench.files import atomic, npz
-from ihbench.files.paths import user_path
-from ihbench.files.pictures import above_half, one_line
+from ihbench.files.pictures import above_half, one_line, read_rgb
 from ihbench.files.safe_pickle import load_pickle
 from ihbench.files.spelling import missing_file
 from ihbench.registry import nearest
+from ihbench.scene.copy_report import SubjectReport
 
 if TYPE_CHECKING:
     import h5py
@@ -56,34 +58,48 @@ COMPARED_FRAMES = 5
 CLEARLY_BETTER = 0.002  # share of vertices by which the last poses must beat the first
 
 
-class PeopleSnapshotRaw:
+class PeopleSnapshotRaw(SubjectFolders["PeopleSnapshotCapture"]):
     """A folder that holds subjects' folders of the released layout, or one of those folders itself."""
 
-    layout = "raw"
-
-    def __init__(self, root: Path):
-        """Raises `BadInput` when there is no such folder, or nothing of this layout in it."""
-        self.root = user_path(root)
-        self._folders = subject_folders(
-            self.root, holds_raw, f"the released PeopleSnapshot layout ({CAMERA_FILE}, {MASKS_FILE}, {POSES_FILE})"
-        )
+    dataset, layout = "people_snapshot", "raw"
+    content = f"the released PeopleSnapshot layout ({CAMERA_FILE}, {MASKS_FILE}, {POSES_FILE})"
 
     @staticmethod
-    def check(root: Path, body: Body | None = None) -> dict[str, Any]:
-        """What this copy is and what it lacks; see `check` below."""
-        return check(root, body=body)
+    def holds(folder: Path) -> bool:
+        return sum((folder / name).is_file() for name in (CAMERA_FILE, MASKS_FILE, POSES_FILE)) >= 2
 
-    def subjects(self) -> list[str]:
-        """Names of the folders, sorted."""
-        return sorted(self._folders)
+    def capture(self, subject: str, body: Body | None) -> PeopleSnapshotCapture:
+        return PeopleSnapshotCapture(self._folders[subject], body)
 
-    def open(self, subject: str, body: Body | None = None) -> PeopleSnapshotCapture:
-        """One subject. Reads the camera, the poses and the headers of video and masks.
-
-        `body` is the SMPL model of the subject's gender; it decides which of surplus poses belong to the masks.
-        Raises `BadInput` for an unknown subject or a damaged one.
-        """
-        return PeopleSnapshotCapture(chosen_folder(self.root, self._folders, subject), body)
+    def inspect(self, capture: PeopleSnapshotCapture, report: SubjectReport) -> list[View]:
+        """Decodes the video up to the last of the frames that are looked at."""
+        report.gender = capture.gender
+        counts = {"video": capture.video.n_frames, "masks": capture.n_masks, "poses": capture.n_poses}
+        report.files = dict(counts)
+        report.missing = {name: max(0, capture.n_masks - counts[name]) for name in ("video", "poses")}
+        if len(set(counts.values())) > 1:
+            report.warn(
+                f"{counts['video']} frames of video, {counts['masks']} masks, {counts['poses']} poses: what goes "
+                f"beyond the {capture.n_frames} that all have is not used; right if the same first frames were kept "
+                f"of each"
+            )
+        shares = capture.alignment_shares
+        overlaps = {name: round(shares[name], 4) if shares else None for name in ("first", "last")}
+        report.alignment = {"chosen": capture.alignment, **overlaps}
+        pose, trans, betas = capture._poses
+        report_spoiled_rows(report, capture.folder / POSES_FILE, pose, trans)
+        if (consensus := capture.folder / CONSENSUS_FILE).is_file():
+            report.files["consensus"] = 1
+            try:
+                report.consensus_betas = round(float(np.abs(read_consensus(consensus)[0] - betas).max()), 4)
+            except BadInput as error:
+                report.problem(str(error))
+        if (keypoints := capture.folder / KEYPOINTS_FILE).is_file():
+            try:
+                report.files["keypoints"] = len(read_keypoints(keypoints))
+            except BadInput as error:
+                report.problem(str(error))
+        return [(0, frame) for frame in range(capture.n_frames)]
 
 
 class SnapshotFolder(CaptureFolder):
@@ -103,13 +119,48 @@ class SnapshotFolder(CaptureFolder):
         if source != "mask":
             raise BadInput(f"silhouette source {source!r}: {nearest(source, ['mask'])}")
 
-    def check_size(self, path: Path, picture: NDArray, camera: Camera) -> None:
-        """Raise `BadInput` when a picture or mask [H, W, …] is not of the camera's size."""
-        if picture.shape[:2] != (camera.height, camera.width):
-            raise BadInput(
-                f"{path}: {picture.shape[1]}×{picture.shape[0]} px, but the camera is {camera.width}×{camera.height} "
-                f"px; expected images and masks of the camera's size, make them anew"
-            )
+
+class SnapshotPictures(SnapshotFolder):
+    """A layout with an image and a mask file for each frame."""
+
+    @abstractmethod
+    def image_path(self, frame: int) -> Path:
+        """Raises `BadInput` for a frame that the copy does not list."""
+
+    @abstractmethod
+    def mask_path(self, frame: int) -> Path: ...
+
+    @staticmethod
+    @abstractmethod
+    def read_mask(path: Path) -> NDArray[np.bool_]:
+        """[H, W], True = person. Raises `BadInput`."""
+
+    def image(self, camera: int, frame: int) -> NDArray[np.uint8]:
+        """[H, W, 3] RGB, as stored."""
+        self.check_index(camera, frame)
+        return self.read_picture(self.image_path(frame), camera, read_rgb, f"expected the image of frame {frame}")
+
+    def silhouette(self, camera: int, frame: int, source: str = "mask") -> NDArray[np.bool_]:
+        """[H, W], True where the stored mask is above one half. `source` is "mask"."""
+        self.check_index(camera, frame)
+        self.check_source(source)
+        return self.read_picture(self.mask_path(frame), camera, self.read_mask, f"expected the mask of frame {frame}")
+
+    def content_digest(self, camera: int, frame: int, source: str = "mask") -> bytes:
+        """Hash of the bytes of the frame's image and mask files; a missing file counts as empty."""
+        self.check_index(camera, frame)
+        digest = hashlib.sha256()
+        try:
+            paths = self.files_of(camera, frame, source)
+        except BadInput:  # the copy does not list it
+            paths = ()
+        for path in paths:
+            data = path.read_bytes() if path.is_file() else b""
+            digest.update(len(data).to_bytes(8, "little") + data)
+        return digest.digest()
+
+    def files_of(self, camera: int, frame: int, source: str) -> tuple[Path, ...]:
+        return self.image_path(frame), self.mask_path(frame)
 
 
 class PeopleSnapshotCapture(SnapshotFolder):
@@ -167,8 +218,8 @@ class PeopleSnapshotCapture(SnapshotFolder):
         shares = {}
         for name, offset in (("first", 0), ("last", surplus)):
             points = [self._camera.project(self.model.pose(self._stored_pose(frame + offset))) for frame in frames]
-            found = [share_inside(p, self.silhouette(0, f)) for p, f in zip(points, frames, strict=True)]
-            shares[name] = float(np.mean(found))
+            inside = [share_inside(p, self.silhouette(0, f)) for p, f in zip(points, frames, strict=True)]
+            shares[name] = float(np.mean(inside))
         return shares
 
     def camera(self, camera: int) -> Camera:
@@ -187,9 +238,7 @@ class PeopleSnapshotCapture(SnapshotFolder):
     def image(self, camera: int, frame: int) -> NDArray[np.uint8]:
         """[H, W, 3] RGB, decoded from the video. Fast when frames are asked for in order."""
         self.check_index(camera, frame)
-        image = self.video.frame(frame)
-        self.check_size(self.video.path, image, self._camera)
-        return image
+        return self.check_size(self.video.path, self.video.frame(frame))
 
     def silhouette(self, camera: int, frame: int, source: str = "mask") -> NDArray[np.bool_]:
         """[H, W]. `source` is "mask"."""
@@ -218,35 +267,6 @@ class PeopleSnapshotCapture(SnapshotFolder):
             return b""
 
 
-def holds_raw(folder: Path) -> bool:
-    """Whether a folder is a subject of the released layout, perhaps with one of its files missing."""
-    return sum((folder / name).is_file() for name in (CAMERA_FILE, MASKS_FILE, POSES_FILE)) >= 2
-
-
-def subject_folders(root: Path, holds: Callable[[Path], bool], wanted: str) -> dict[str, Path]:
-    """Name -> folder of the subjects in root, or of root itself. Raises `BadInput` when there is none."""
-    if not root.is_dir():
-        raise BadInput(f"{root}: no such folder; give the folder that holds the subjects' folders")
-    itself = root.absolute()  # "." may be a subject's folder
-    try:
-        inside = [itself] if holds(itself) else [folder for folder in sorted(itself.iterdir()) if folder.is_dir()]
-        found = {folder.name: folder for folder in inside if not folder.name.startswith(".") and holds(folder)}
-        below = None if found else next((path.parent for path in itself.glob("*/*/") if holds(path)), None)
-    except OSError as error:
-        raise BadInput(f"{root}: cannot be listed ({error.strerror}); expected a readable folder") from error
-    if not found:
-        hint = f"there is one in {below}, give that folder" if below else f"expected {wanted}"
-        raise BadInput(f"{root}: no subject of this layout in it; {hint}")
-    return found
-
-
-def chosen_folder(root: Path, folders: dict[str, Path], subject: str) -> Path:
-    """The subject's folder. Raises `BadInput` with the nearest known name."""
-    if subject not in folders:
-        raise BadInput(f"{root}: no subject {subject!r}: {nearest(subject, sorted(folders))}")
-    return folders[subject]
-
-
 def video_path(folder: Path) -> Path:
     """`<subject>.mp4`, or the only .mp4 of a folder that was renamed. Raises `BadInput` when there is none."""
     path = folder / f"{folder.name}.mp4"
@@ -257,6 +277,16 @@ def video_path(folder: Path) -> Path:
         return others[0]
     found = f"{len(others)} other .mp4 files, none of this name" if others else "no .mp4 file"
     raise missing_file(path, f"expected the subject's video, found {found}; copy it here")
+
+
+def report_spoiled_rows(report: SubjectReport, path: Path, *arrays: NDArray) -> None:
+    """Name the rows of a file's arrays [N, …] that hold NaN or infinity, if there are any."""
+    bad = [~np.isfinite(array.reshape(len(array), -1)).all(1) for array in arrays]
+    rows = np.flatnonzero(np.any(bad, axis=0)).tolist()
+    if rows:
+        named = ", ".join(str(row) for row in rows[:5]) + (", …" if len(rows) > 5 else "")
+        state = f"NaN or infinity in {len(rows)} row{'s' * (len(rows) > 1)} ({named})"
+        report.problem(f"{path}: {state}; leave these out {BY_OPTIONS}")
 
 
 # ---------------------------------------------------------------------------------------------- the files
@@ -536,111 +566,6 @@ class Video:
                 f"turned as the camera and the masks have them"
             )
         return stream
-
-
-# ----------------------------------------------------------------------------------------------- check
-
-
-def check(root: Path, samples: int = 3, body: Body | None = None) -> dict[str, Any]:
-    """What this copy is and what it lacks, for `ihbench data check`.
-
-    Decodes `samples` frames a subject, which decodes the video up to the last of them. Raises `BadInput` when the
-    root is not of this layout at all; what is wrong with a subject is listed in its "problems". `vertices_in_mask` is
-    the share of body vertices that project into the silhouette (grown by 1 % of the image's width); it needs a body,
-    which stand-ins have. "alignment" says which poses were taken and the shares that decided. `consensus_betas` is
-    the largest difference of consensus.pkl's betas from the poses' own.
-    """
-    return checked(PeopleSnapshotRaw(root), body, lambda capture, found: _inspect(capture, samples, found))
-
-
-def checked(dataset: Any, body: Body | None, inspect: Callable[[Any, dict[str, Any]], None]) -> dict[str, Any]:
-    """The report of `check` for every subject of a data set; `inspect` adds what a layout has to say to one."""
-    subjects = []
-    for name in dataset.subjects():
-        problems: list[str] = []
-        found: dict[str, Any] = {"subject": name, "problems": problems, "warnings": []}
-        subjects.append(found)
-        try:
-            capture = dataset.open(name, body)
-            found |= {
-                "standin": capture.standin,
-                "body": capture.body,
-                "gender": capture.gender,
-                "variant": capture.variant,
-                "cameras": len(capture.camera_ids),
-                "frames": capture.n_frames,
-            }
-            inspect(capture, found)
-        except BadInput as error:
-            problems.append(str(error))
-    return {
-        "dataset": SnapshotFolder.dataset,
-        "layout": dataset.layout,
-        "root": str(dataset.root),
-        "standin": next((subject["standin"] for subject in subjects if subject.get("standin")), ""),
-        "subjects": subjects,
-        "ok": not any(subject["problems"] for subject in subjects),
-    }
-
-
-def sample_frames(capture: Any, frames: Sequence[int], samples: int, found: dict[str, Any]) -> None:
-    """Decode a few of the frames and project the body into their silhouettes; adds the result to `found`."""
-    model = capture.model if capture.has_model else None
-
-    def outline(frame: int) -> Outline:
-        assert model is not None
-        return Outline(model.pose(capture.body_pose(frame)), model.faces)
-
-    views = [(0, frame) for frame in frames]
-    examine(capture, views, found, whole=True, outline=outline if model else None, samples=samples)
-
-
-def spoiled_rows(*arrays: NDArray) -> list[int]:
-    """The rows that hold NaN or infinity in any of the arrays [N, …]."""
-    bad = np.zeros(len(arrays[0]), bool)
-    for array in arrays:
-        bad |= ~np.isfinite(array.reshape(len(array), -1)).all(1)
-    return np.flatnonzero(bad).tolist()
-
-
-def spelled_rows(path: Path, rows: list[int]) -> str:
-    """The problem "NaN in these rows", with the first few named."""
-    named = ", ".join(str(row) for row in rows[:5]) + (", …" if len(rows) > 5 else "")
-    several = "s" * (len(rows) > 1)
-    return f"{path}: NaN or infinity in {len(rows)} row{several} ({named}); leave these out {BY_OPTIONS}"
-
-
-def _inspect(capture: PeopleSnapshotCapture, samples: int, found: dict[str, Any]) -> None:
-    problems = found["problems"]
-    counts = {"video": capture.video.n_frames, "masks": capture.n_masks, "poses": capture.n_poses}
-    found["files"] = dict(counts)
-    found["missing"] = {name: max(0, capture.n_masks - counts[name]) for name in ("video", "poses")}
-    if len(set(counts.values())) > 1:
-        found["warnings"].append(
-            f"{counts['video']} frames of video, {counts['masks']} masks, {counts['poses']} poses: what goes beyond "
-            f"the {capture.n_frames} that all have is not used; right if the same first frames were kept of each"
-        )
-    shares = capture.alignment_shares
-    found["alignment"] = {
-        "chosen": capture.alignment,
-        **{name: round(shares[name], 4) if shares else None for name in ("first", "last")},
-    }
-    pose, trans, betas = capture._poses
-    if rows := spoiled_rows(pose, trans):
-        problems.append(spelled_rows(capture.folder / POSES_FILE, rows))
-    if (capture.folder / CONSENSUS_FILE).is_file():
-        found["files"]["consensus"] = 1
-        try:
-            personal, _ = read_consensus(capture.folder / CONSENSUS_FILE)
-            found["consensus_betas"] = round(float(np.abs(personal - betas).max()), 4)
-        except BadInput as error:
-            problems.append(str(error))
-    if (capture.folder / KEYPOINTS_FILE).is_file():
-        try:
-            found["files"]["keypoints"] = len(read_keypoints(capture.folder / KEYPOINTS_FILE))
-        except BadInput as error:
-            problems.append(str(error))
-    sample_frames(capture, range(capture.n_frames), samples, found)
 
 
 # ----------------------------------------------------------------------------------------------- write

@@ -30,16 +30,17 @@ from ihbench.body.pose import BodyPose
 from ihbench.body.skeleton import pose_hint
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera, off_orthogonal
-from ihbench.datasets.reading.capture_folder import CaptureFolder
-from ihbench.datasets.reading.plausibility import SOFT_VALUES, Outline, examine
+from ihbench.datasets.reading.capture_folder import CaptureFolder, Picture
+from ihbench.datasets.reading.plausibility import SOFT_VALUES, Outline
 from ihbench.datasets.reading.standin_mark import STANDIN_FILE
+from ihbench.datasets.reading.subject_folders import SubjectFolders, View
 from ihbench.errors import BadInput, BadValue
 from ihbench.files import atomic
 from ihbench.files.npz import read_npz
-from ihbench.files.paths import user_path
 from ihbench.files.pictures import encoded, one_line, read_mask, read_rgb
 from ihbench.files.spelling import as_stored, missing_file, same_name
 from ihbench.registry import nearest
+from ihbench.scene.copy_report import SubjectReport
 
 Array = NDArray[np.float64]
 
@@ -53,52 +54,45 @@ JPEG_QUALITY = 95
 SMPL_PELVIS = (0.0, -0.24, 0.03)  # m, about, in SMPL's rest pose; only `check` uses it
 
 
-class PlainScene:
-    """A scene folder, or a folder that holds several. A subject is named by scene.json, else by its folder."""
+class PlainScene(SubjectFolders["PlainCapture"]):
+    """A scene folder, or a folder that holds several. A subject is named by scene.json, else by its folder.
 
-    def __init__(self, root: Path):
-        """Raises `BadInput` when there is no such folder, no scene in it, or two scenes have one name."""
-        self.root = user_path(root)
-        if not self.root.is_dir():
-            raise BadInput(f"{self.root}: no such folder; give a scene folder (with {CAMERAS_FILE} in it)")
-        if _is_scene(self.root):
-            folders = [self.root.absolute()]  # "." has a name, too
-        else:
-            folders = sorted(folder for folder in self.root.iterdir() if folder.is_dir() and _is_scene(folder))
-        if not folders:
-            below = next(self.root.glob(f"*/*/{CAMERAS_FILE}"), None)
-            where = f"; there is one in {below.parent.parent}, give that folder" if below else ""
-            raise BadInput(
-                f"{self.root}: neither {CAMERAS_FILE} nor {POSES_FILE} in it or in a folder of it; "
-                f"expected a scene folder or a folder of scene folders{where}"
-            )
-        self._folders: dict[str, Path] = {}
-        for folder in folders:
-            name = read_about(folder)["name"]
-            if name in self._folders:
-                raise BadInput(
-                    f"{folder}: named {name!r}, as {self._folders[name].name} is; rename one in {SCENE_FILE}"
-                )
-            self._folders[name] = folder
+    Without the SMPL model of the poses and body.npz, `check` takes the bench's own body in mean shape ("body_used"):
+    good for units, axes and flips. An occluded person has few of the body's vertices in the mask; wrong cameras,
+    units or poses also leave little of the mask on the body. A person who stands upright in the middle of a picture
+    has no mirror image to tell apart.
+    """
+
+    dataset, layout = "custom", "plain"
+    content = f"a scene ({CAMERAS_FILE} and {POSES_FILE}), or several"
+    whole = None  # nobody says whether something hides parts of the person
 
     @staticmethod
-    def check(root: Path, body: Body | None = None) -> dict[str, Any]:
-        """What these scenes hold and lack; see `check` below."""
-        return check(root, body=body)
+    def holds(folder: Path) -> bool:
+        return any(as_stored(folder / name).is_file() for name in (CAMERAS_FILE, POSES_FILE))
 
-    def subjects(self) -> list[str]:
-        """Names, sorted."""
-        return sorted(self._folders)
+    def name_of(self, folder: Path) -> str:
+        return read_about(folder)["name"]
 
-    def open(self, subject: str, body: Body | None = None) -> PlainCapture:
-        """One scene. Reads cameras.json and poses.npz, no image.
-
-        `body` is the SMPL model the poses belong to; not needed with a body.npz. Raises `BadInput` for an unknown
-        subject, a damaged one, and for another `body` than body.npz holds.
-        """
-        if subject not in self._folders:
-            raise BadInput(f"{self.root}: no subject {subject!r}: {nearest(subject, self.subjects())}")
+    def capture(self, subject: str, body: Body | None) -> PlainCapture:
         return PlainCapture(self._folders[subject], subject, body)
+
+    def inspect(self, capture: PlainCapture, report: SubjectReport) -> list[View]:
+        _check_files(capture, report)
+        cameras, frames = range(len(capture.camera_ids)), range(capture.n_frames)
+        return [(camera, frame) for camera in cameras for frame in frames if not capture.lacks(camera, frame)]
+
+    def bodies(self, capture: PlainCapture, report: SubjectReport) -> tuple[Callable[[int], Outline] | None, bool]:
+        """The bench's body stands in SMPL's place where that is not at hand."""
+        try:
+            report.body_used = capture.model.name
+            return super().bodies(capture, report)
+        except BadInput:
+            if capture.body != "smpl":
+                raise
+        report.body_used = "procedural, in SMPL's place"
+        model = load_body()
+        return lambda frame: Outline(model.pose(_like_smpl(capture, frame, model)), model.faces), False
 
 
 class PlainCapture(CaptureFolder):
@@ -109,6 +103,7 @@ class PlainCapture(CaptureFolder):
 
     dataset = "custom"
     variant = "plain"
+    size_source = f"{CAMERAS_FILE} says"
 
     def __init__(self, folder: Path, name: str, body: Body | None = None):
         has_own_body = as_stored(folder / BODY_FILE).is_file()
@@ -147,6 +142,10 @@ class PlainCapture(CaptureFolder):
         except (zlib.error, NotImplementedError, RuntimeError) as error:
             raise BadInput(f"{path}: damaged ({one_line(error)}); write the file again") from error
 
+    @property
+    def has_model(self) -> bool:
+        return self.body == "own" or super().has_model
+
     def camera(self, camera: int) -> Camera:
         self.check_index(camera, 0)
         return self._cameras[self.camera_ids[camera]]
@@ -167,13 +166,13 @@ class PlainCapture(CaptureFolder):
 
     def image(self, camera: int, frame: int) -> NDArray[np.uint8]:
         """[H, W, 3] RGB, as stored; an alpha channel is dropped."""
-        return self._read_picture("images", camera, frame, read_rgb)
+        return self._read("images", camera, frame, read_rgb)
 
     def silhouette(self, camera: int, frame: int, source: str = "mask") -> NDArray[np.bool_]:
         """[H, W] non-zero in masks/. `source` is "mask", there is no other."""
         if source != "mask":
             raise BadInput(f"silhouette source {source!r}: {nearest(source, ['mask'])}")
-        return self._read_picture("masks", camera, frame, lambda path: read_mask(path, "non-zero"))
+        return self._read("masks", camera, frame, lambda path: read_mask(path, "non-zero"))
 
     def content_digest(self, camera: int, frame: int, source: str = "mask") -> bytes:
         """Hash of the bytes of one view's image and mask file; a missing file counts as empty."""
@@ -222,7 +221,7 @@ class PlainCapture(CaptureFolder):
             self._listings[key] = listing
         return self._listings[key]
 
-    def _read_picture(self, kind: str, camera: int, frame: int, read: Callable[[Path], NDArray]) -> NDArray:
+    def _read(self, kind: str, camera: int, frame: int, read: Callable[[Path], Picture]) -> Picture:
         number = self.number(frame)
         paths = self.files(kind, camera).get(number, [])
         if len(paths) > 1:
@@ -232,18 +231,7 @@ class PlainCapture(CaptureFolder):
             path = self.picture_folder(kind, camera) / f"{number:06d}.png"
             or_else = " or .jpg" if kind == "images" else ""
             raise BadInput(f"{path}{or_else}: no such file; {POSES_FILE} has frame {number}{self.standin_hint}")
-        picture = read(paths[0])
-        view = self.camera(camera)
-        if picture.shape[:2] != (view.height, view.width):
-            raise BadInput(
-                f"{paths[0]}: {picture.shape[1]}×{picture.shape[0]} px, but {CAMERAS_FILE} says "
-                f"{view.width}×{view.height} px for camera {self.camera_ids[camera]!r}; make them agree"
-            )
-        return picture
-
-
-def _is_scene(folder: Path) -> bool:
-    return any(as_stored(folder / name).is_file() for name in (CAMERAS_FILE, POSES_FILE))
+        return self.check_size(paths[0], read(paths[0]), camera)
 
 
 def _pictures(folder: Path, endings: Sequence[str]) -> list[Path]:
@@ -435,66 +423,8 @@ def _read_npz(path: Path) -> dict[str, NDArray]:
 # ----------------------------------------------------------------------------------------------- check
 
 
-def check(root: Path, samples: int = 3, body: Body | None = None) -> dict[str, Any]:
-    """What these scenes hold and lack, for `ihbench data check`.
-
-    Lists folders and holds the body against masks of up to four cameras (`plausibility.examine`). Without `body` (the
-    SMPL model of the poses) and body.npz, the bench's own body in mean shape stands for SMPL ("body_used"): good for
-    units, axes and flips. Raises `BadInput` when the root is no scene folder; what is wrong with a scene is in its
-    "problems", what may be wrong in its "warnings". `vertices_in_mask` is the share of body vertices that project
-    into the silhouette (grown by 1 %), `mask_on_body` the share of the silhouette on the body (grown by 3 % of its
-    height); an occluded person has less of the former, wrong cameras, units or poses less of both. A person who
-    stands upright in the middle of a picture has no mirror image to tell apart.
-    """
-    dataset = PlainScene(root)
-    subjects = [_check_subject(dataset, name, samples, body) for name in dataset.subjects()]
-    return {
-        "dataset": PlainCapture.dataset,
-        "layout": PlainCapture.variant,
-        "root": str(dataset.root),
-        "standin": next((subject["standin"] for subject in subjects if subject.get("standin")), ""),
-        "subjects": subjects,
-        "ok": not any(subject["problems"] for subject in subjects),
-    }
-
-
-def _check_subject(dataset: PlainScene, name: str, samples: int, body: Body | None) -> dict[str, Any]:
-    problems: list[str] = []
-    found: dict[str, Any] = {"subject": name, "problems": problems, "warnings": []}
-    try:
-        capture = dataset.open(name)
-        if body is not None and capture.body == body.name:
-            capture = dataset.open(name, body)
-    except BadInput as error:
-        problems.append(str(error))
-        return found
-    found |= {
-        "standin": capture.standin,
-        "body": capture.body,
-        "variant": capture.variant,
-        "cameras": len(capture.camera_ids),
-        "frames": capture.n_frames,
-    }
-    _check_files(capture, found, problems)
-    try:
-        outline, exact = _outlines(capture, found)
-    except BadInput as error:
-        problems.append(str(error))
-        return found
-    views = [
-        (camera, frame)
-        for camera in range(len(capture.camera_ids))
-        for frame in range(capture.n_frames)
-        if not capture.lacks(camera, frame)
-    ]
-    if not views:
-        problems.append("no image with its mask and pose found")
-    examine(capture, views, found, whole=None, outline=outline, exact=exact, samples=samples)
-    return found
-
-
-def _check_files(capture: PlainCapture, found: dict[str, Any], problems: list[str]) -> None:
-    _check_numbers(capture, found, problems)
+def _check_files(capture: PlainCapture, report: SubjectReport) -> None:
+    _check_numbers(capture, report)
     posed = {capture.number(frame) for frame in range(capture.n_frames)}
     counts = {"image": 0, "mask": 0}
     missing = {"image": 0, "mask": 0, "pose": 0}
@@ -506,7 +436,7 @@ def _check_files(capture: PlainCapture, found: dict[str, Any], problems: list[st
         missing["pose"] += len(images.keys() - posed)
         if poseless := images.keys() - posed:
             what = f"{len(poseless)} images{here} have no pose in {POSES_FILE} and are not used"
-            found["warnings"].append(f"{what}; the first is frame {min(poseless)}")
+            report.warn(f"{what}; the first is frame {min(poseless)}")
         lacks = {
             "image": (posed - images.keys(), f"poses have no image{here}"),
             "mask": (images.keys() & posed - masks.keys(), f"images{here} have no mask"),
@@ -514,7 +444,7 @@ def _check_files(capture: PlainCapture, found: dict[str, Any], problems: list[st
         for what, (numbers, text) in lacks.items():
             missing[what] += len(numbers)
             if numbers and not (capture.standin and what == "image"):
-                problems.append(
+                report.problem(
                     f"{len(numbers)} {text}; the first is frame {min(numbers)}: copy the files, or leave "
                     f"these frames out of {POSES_FILE}"
                 )
@@ -522,7 +452,7 @@ def _check_files(capture: PlainCapture, found: dict[str, Any], problems: list[st
             for number, paths in listing.items():
                 if len(paths) > 1:
                     names = " and ".join(path.name for path in paths)
-                    problems.append(f"{paths[0].parent}: {names} are both frame {number}; keep one of them")
+                    report.problem(f"{paths[0].parent}: {names} are both frame {number}; keep one of them")
         for kind in ("images", "masks"):
             odd = [
                 path
@@ -531,19 +461,20 @@ def _check_files(capture: PlainCapture, found: dict[str, Any], problems: list[st
             ]
             if odd:
                 ending = "png" if kind == "masks" else "png or .jpg"
-                problems.append(f"{odd[0]}: {len(odd)} such names are ignored; expected <frame number>.{ending}")
-    found["files"], found["missing"] = counts, missing
+                report.problem(f"{odd[0]}: {len(odd)} such names are ignored; expected <frame number>.{ending}")
+    report.files, report.missing = counts, missing
     for kind in ("images", "masks"):
         folder = as_stored(capture.folder / kind)
         if not folder.is_dir():
-            problems.append(f"{folder}: no such folder")
+            report.problem(f"{folder}: no such folder")
         elif len(capture.camera_ids) > 1:
             known = {same_name(name) for name in capture.camera_ids}
             strays = sorted(f.name for f in folder.iterdir() if f.is_dir() and same_name(f.name) not in known)
-            problems += [f"{folder / stray}: {CAMERAS_FILE} has no camera of this name" for stray in strays]
+            for stray in strays:
+                report.problem(f"{folder / stray}: {CAMERAS_FILE} has no camera of this name")
 
 
-def _check_numbers(capture: PlainCapture, found: dict[str, Any], problems: list[str]) -> None:
+def _check_numbers(capture: PlainCapture, report: SubjectReport) -> None:
     """Whether the rows of poses.npz and the files of the images count the same frames."""
     pictured = sorted(
         {number for camera in range(len(capture.camera_ids)) for number in capture.files("images", camera)}
@@ -553,30 +484,16 @@ def _check_numbers(capture: PlainCapture, found: dict[str, Any], problems: list[
         return
     if not set(pictured) & set(rows) or (not capture._poses.numbered and len(pictured) == len(rows)):
         without = "" if capture._poses.numbered else ", since it has no array 'frames'"
-        problems.append(
+        report.problem(
             f"{capture.folder / POSES_FILE}: its {len(rows)} rows are of frames {rows[0]} to {rows[-1]}{without}, "
             f"but the {len(pictured)} images are numbered {pictured[0]} to {pictured[-1]}; write the image's number "
             f"of each row as 'frames'"
         )
     elif capture.without_image:
-        found["warnings"].append(
+        report.warn(
             f"{len(capture.without_image)} poses have no image and are not used; the first is frame "
             f"{capture.without_image[0]}"
         )
-
-
-def _outlines(capture: PlainCapture, found: dict[str, Any]) -> tuple[Callable[[int], Outline], bool]:
-    """The body of a frame, of SMPL or of the bench's body in its place, and whether it is the former."""
-    try:
-        model = capture.model
-    except BadInput:
-        if capture.body != "smpl":
-            raise
-        found["body_used"] = "procedural, in SMPL's place"
-        model = load_body()
-        return lambda frame: Outline(model.pose(_like_smpl(capture, frame, model)), model.faces), False
-    found["body_used"] = model.name
-    return lambda frame: Outline(model.pose(capture.body_pose(frame)), model.faces), True
 
 
 def _like_smpl(capture: PlainCapture, frame: int, model: Body) -> BodyPose:

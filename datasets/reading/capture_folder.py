@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +16,9 @@ from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.datasets.reading.standin_mark import standin_mark
 from ihbench.errors import BadInput
+from ihbench.files.spelling import missing_file
+
+Picture = TypeVar("Picture", bound=NDArray[Any])
 
 BY_OPTIONS = "(--train-frames, --test-frames)"  # how a frame of a fixed recording is left out
 
@@ -21,6 +26,8 @@ BY_OPTIONS = "(--train-frames, --test-frames)"  # how a frame of a fixed recordi
 class CaptureFolder(ABC):
     """One subject's folder. A format adds what `scene.contracts.Capture` asks for."""
 
+    dataset: str
+    variant: str
     n_frames: int
     camera_ids: tuple[str, ...]
     visible_masks: bool = False
@@ -84,6 +91,30 @@ class CaptureFolder(ABC):
 
     @abstractmethod
     def silhouette(self, camera: int, frame: int, source: str = "mask") -> NDArray[np.bool_]: ...
+
+    def image_size(self, camera: int) -> tuple[int, int]:
+        """(width, height) px of a camera's pictures."""
+        view = self.camera(camera)
+        return view.width, view.height
+
+    size_source = "the camera's images are"  # what says so, for messages
+
+    def check_size(self, path: Path, picture: Picture, camera: int = 0) -> Picture:
+        """The picture or mask [H, W, …] itself. Raises `BadInput` when it is not of the camera's size."""
+        width, height = self.image_size(camera)
+        if picture.shape[:2] != (height, width):
+            raise BadInput(
+                f"{path}: {picture.shape[1]}×{picture.shape[0]} px, but {self.size_source} {width}×{height} px; "
+                f"expected one size for a camera's images and masks, make them anew"
+            )
+        return picture
+
+    def read_picture(self, path: Path, camera: int, read: Callable[[Path], Picture], expected: str) -> Picture:
+        """A picture file by its reader. Raises `BadInput` when it is missing, damaged or of another size."""
+        if not path.is_file():
+            missing = "file" if path.parent.is_dir() else f"file, nor its folder {path.parent.name}"
+            raise missing_file(path, f"{expected}{self.standin_hint}", f"no such {missing}")
+        return self.check_size(path, read(path), camera)
 
     def stored_pose(self, frame: int) -> BodyPose:
         """The numbers of a frame as the files hold them, whatever their root convention: needs no body model."""

@@ -21,6 +21,7 @@ from ihbench.camera import Camera
 from ihbench.datasets.reading.capture_folder import CaptureFolder
 from ihbench.errors import BadInput
 from ihbench.files.pictures import read_picture
+from ihbench.scene.copy_report import SubjectReport
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -54,22 +55,6 @@ ADVICE = {
     "double": "K looks like that of pictures twice as large; divide its first two rows by 2",
 }
 SCALES = {"half": 2.0, "double": 0.5}
-
-
-@dataclass
-class Report:
-    """What is said of one subject. The two lists are those of `found`, each line once."""
-
-    problems: list[str]
-    warnings: list[str]
-
-    def problem(self, text: str) -> None:
-        if text not in self.problems:
-            self.problems.append(text)
-
-    def warn(self, text: str) -> None:
-        if text not in self.warnings:
-            self.warnings.append(text)
 
 
 @dataclass
@@ -148,7 +133,7 @@ def share_inside(points: Array, region: Mask) -> float:
 def examine(
     capture: CaptureFolder,
     views: Sequence[tuple[int, int]],  # (camera, frame) that have image, mask and pose
-    found: dict[str, Any],  # a subject's entry of a check; its "problems" and "warnings" get lines
+    report: SubjectReport,  # gets problems, warnings and what was measured
     *,
     whole: bool | None,  # masks show whole people (True), what is not hidden (False), or nobody knows (None)
     outline: Callable[[int], Outline] | None,  # the body of a frame; None: no model at hand
@@ -157,9 +142,8 @@ def examine(
 ) -> None:
     """Decode a few views and say what cannot be, or may not be, right about cameras, poses, masks and their fit.
 
-    Adds "sampled_images", "image_size" and, with an outline, "vertices_in_mask" and "mask_on_body" to `found`.
+    Reports the sampled images, their sizes and, with an outline, `vertices_in_mask` and `mask_on_body`.
     """
-    report = Report(found["problems"], found["warnings"])
     _check_poses(capture, report)
     usable = _check_cameras(capture, report)
     posed: dict[int, Outline] = {}
@@ -173,7 +157,7 @@ def examine(
         posed = _usable(frames, outline, lambda frame: f"frame {capture.label(frame)}", report)
         plausible = _check_shape(capture, report)
         aimed = set(_check_placement(capture, usable, list(posed.values())[:: max(1, len(posed) // 8)], report))
-    _check_images(capture, views, samples, found, report)
+    _check_images(capture, views, samples, report)
     masks = _usable(views, lambda v: capture.silhouette(*v), lambda v: _views(capture, [v]), report)
     if not masks:
         return
@@ -194,7 +178,7 @@ def examine(
         if camera in aimed and frame in posed
     ]
     assert outline is not None
-    _check_fit(capture, fits, found, report, whole, exact, outline)
+    _check_fit(capture, fits, report, whole, exact, outline)
 
 
 def _spread(views: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
@@ -212,7 +196,9 @@ def _evenly(items: Sequence[Any], count: int) -> list[Any]:
     return [items[k] for k in sorted(set(picked.tolist()))]
 
 
-def _usable(items: Iterable[Any], read: Callable[[Any], Any], name: Callable[[Any], str], report: Report) -> dict:
+def _usable(
+    items: Iterable[Any], read: Callable[[Any], Any], name: Callable[[Any], str], report: SubjectReport
+) -> dict:
     """What can be read of the items, by item. The first few that cannot are named, the others counted."""
     usable, errors = {}, {}
     for item in items:
@@ -230,7 +216,7 @@ def _usable(items: Iterable[Any], read: Callable[[Any], Any], name: Callable[[An
 # ----------------------------------------------------------------------------------------- cameras, poses
 
 
-def _check_cameras(capture: CaptureFolder, report: Report) -> list[int]:
+def _check_cameras(capture: CaptureFolder, report: SubjectReport) -> list[int]:
     """Name cameras that nobody has; return those that can be drawn with."""
     usable, same = [], {}
     for camera, name in enumerate(capture.camera_ids):
@@ -301,7 +287,7 @@ def suspicious_camera(view: Camera) -> str:
 
 
 def _check_placement(
-    capture: CaptureFolder, cameras: Sequence[int], posed: Sequence[Outline], report: Report
+    capture: CaptureFolder, cameras: Sequence[int], posed: Sequence[Outline], report: SubjectReport
 ) -> list[int]:
     """Name cameras with implausible units or without the body in view; return the others."""
     groups: dict[str, list[tuple[int, float]]] = {"far": [], "near": [], "behind": [], "aside": [], "inside": []}
@@ -354,7 +340,7 @@ def _check_placement(
     return good
 
 
-def _check_poses(capture: CaptureFolder, report: Report) -> None:
+def _check_poses(capture: CaptureFolder, report: SubjectReport) -> None:
     """Name rotations, shapes and motions that people do not have."""
     poses: dict[int, BodyPose] = {}
     for frame in _evenly(range(capture.n_frames), 2 * COMPARED_MASKS):
@@ -396,7 +382,7 @@ def _masks_stand_still(capture: CaptureFolder, frames: Sequence[int]) -> bool:
     return all(_iou(mask, masks[0]) > 0.9 for mask in masks if mask.shape == masks[0].shape and mask.any())
 
 
-def _check_shape(capture: CaptureFolder, report: Report) -> bool:
+def _check_shape(capture: CaptureFolder, report: SubjectReport) -> bool:
     """Name betas that make no body; False for those."""
     try:
         body_pose, model = capture.stored_pose(0), capture.model
@@ -423,8 +409,7 @@ def _check_images(
     capture: CaptureFolder,
     views: Sequence[tuple[int, int]],
     samples: int,
-    found: dict[str, Any],
-    report: Report,
+    report: SubjectReport,
 ) -> None:
     """Decode `samples` images a camera and the image after each: damaged ones, and pictures that stand still."""
     sizes, decoded_images = set(), 0
@@ -455,11 +440,11 @@ def _check_images(
                 f"frame {repeated[0]}{name} shows the picture of frame {repeated[0] - 1} again, as "
                 f"{len(seen) - len(set(seen.values()))} of {len(seen)} looked at do; expected one picture a frame"
             )
-    found["sampled_images"] = decoded_images
-    found["image_size"] = sorted([list(size) for size in sizes])
+    report.sampled_images = decoded_images
+    report.image_size = sorted([list(size) for size in sizes])
 
 
-def _check_softness(capture: CaptureFolder, masks: dict[tuple[int, int], Mask], report: Report) -> None:
+def _check_softness(capture: CaptureFolder, masks: dict[tuple[int, int], Mask], report: SubjectReport) -> None:
     """Name mattes: what a threshold at zero and one in the middle make of them differs."""
     soft: list[tuple[float, float, float, int, Path]] = []
     for camera, frame in _evenly(list(masks), 8):
@@ -502,7 +487,7 @@ def _check_masks_alone(
     full: list[tuple[int, int]],
     capture: CaptureFolder,
     whole: bool | None,
-    report: Report,
+    report: SubjectReport,
 ) -> None:
     """What masks say without a body to hold against them."""
     from scipy.ndimage import label
@@ -620,8 +605,7 @@ def _seen(points: Array, view: Camera) -> Mask:
 def _check_fit(
     capture: CaptureFolder,
     fits: list[Overlap],
-    found: dict[str, Any],
-    report: Report,
+    report: SubjectReport,
     whole: bool | None,
     exact: bool,
     outline: Callable[[int], Outline],
@@ -634,8 +618,8 @@ def _check_fit(
     are_empty = f"{len(empty)} of {len(fits)} masks looked at are empty ({_views(capture, empty)})"
     if empty and whole is False:
         report.warn(are_empty)
-    inside = found["vertices_in_mask"] = round(float(np.mean([fit.vertices_in_mask for fit in visible])), 4)
-    covered = found["mask_on_body"] = round(float(np.mean([fit.mask_on_body for fit in visible])), 4)
+    inside = report.vertices_in_mask = round(float(np.mean([fit.vertices_in_mask for fit in visible])), 4)
+    covered = report.mask_on_body = round(float(np.mean([fit.mask_on_body for fit in visible])), 4)
     low = [fit for fit in visible if len(fit.iou) > 1]
     iou = {change: float(np.mean([fit.iou[change] for fit in low])) for change in (low[0].iou if low else ())}
     if float(np.mean([fit.border for fit in visible])) < 0.5:  # what is not the person reaches the picture's border
@@ -673,7 +657,9 @@ def _check_fit(
     (report.problem if bad else report.warn)(text)
 
 
-def _check_single_views(capture: CaptureFolder, fits: Sequence[Overlap], whole: bool | None, report: Report) -> bool:
+def _check_single_views(
+    capture: CaptureFolder, fits: Sequence[Overlap], whole: bool | None, report: SubjectReport
+) -> bool:
     """Name views whose mask shows another thing than the body, where most fit; False where none is named."""
     out, others = [], []
     for fit in fits:

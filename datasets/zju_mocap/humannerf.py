@@ -25,16 +25,14 @@ from numpy.typing import NDArray
 from ihbench.body import Body, from_zju_root, zju_root
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
-from ihbench.datasets.reading.capture_folder import CaptureFolder
+from ihbench.datasets.reading.capture_folder import CaptureFolder, Picture
 from ihbench.datasets.reading.pickles import write_pickle
-from ihbench.datasets.reading.plausibility import Outline, examine
+from ihbench.datasets.reading.subject_folders import SubjectFolders, View, count_files
 from ihbench.errors import BadInput
 from ihbench.files import atomic
-from ihbench.files.paths import user_path
 from ihbench.files.pictures import encoded, read_mask, read_rgb, size_of
 from ihbench.files.safe_pickle import load_pickle
-from ihbench.files.spelling import missing_file
-from ihbench.registry import nearest
+from ihbench.scene.copy_report import SubjectReport
 
 NAME = re.compile(r"(?:camera_(\d+)_)?frame_(\d+)")
 FILES = ("cameras.pkl", "mesh_infos.pkl")
@@ -42,40 +40,26 @@ MONOCULAR = "camera"  # the id of the only camera of a copy whose names hold non
 BETAS = 10  # found from joints where a copy holds none
 
 
-class HumanNerfFormat:
+class HumanNerfFormat(SubjectFolders["HumanNerfCapture"]):
     """A folder that holds subjects' folders, or one of those folders itself."""
 
-    def __init__(self, root: Path):
-        """Raises `BadInput` when there is nothing of this layout in it."""
-        self.root = user_path(root)
-        own = [self.root.absolute()] if _is_subject(self.root) else sorted(filter(_is_subject, _folders(self.root)))
-        self._folders = {folder.name: folder for folder in own}
-        if not own:
-            raise BadInput(
-                f"{self.root}: no HumanNeRF-style folder (images, masks, {', '.join(FILES)}) in it; "
-                f"expected what its preparation script writes"
-            )
+    dataset, layout = "zju_mocap", "humannerf"
+    content = f"HumanNeRF-style folders (images, masks, {', '.join(FILES)}), as its preparation script writes them"
+    samples = 4
 
     @staticmethod
-    def check(root: Path, body: Body | None = None) -> dict[str, Any]:
-        return check(HumanNerfFormat(root), body)
+    def holds(folder: Path) -> bool:
+        return (folder / "images").is_dir() and all((folder / name).is_file() for name in FILES)
 
-    def subjects(self) -> list[str]:
-        return sorted(self._folders)
-
-    def open(self, subject: str, body: Body | None = None) -> HumanNerfCapture:
-        """One subject. Reads the pickles only. Raises `BadInput` for an unknown subject or a damaged one."""
-        if subject not in self._folders:
-            raise BadInput(f"{self.root}: no subject {subject!r}: {nearest(subject, self.subjects())}")
+    def capture(self, subject: str, body: Body | None) -> HumanNerfCapture:
         return HumanNerfCapture(self._folders[subject], body)
 
-
-def _is_subject(folder: Path) -> bool:
-    return (folder / "images").is_dir() and all((folder / name).is_file() for name in FILES)
-
-
-def _folders(root: Path) -> list[Path]:
-    return [path for path in root.iterdir() if path.is_dir()] if root.is_dir() else []
+    def inspect(self, capture: HumanNerfCapture, report: SubjectReport) -> list[View]:
+        views = capture.views
+        report.views = len(views)
+        kinds = {kind: {view: capture.picture(kind, *view) for view in views} for kind in ("images", "masks")}
+        there = count_files(report, kinds)
+        return sorted(there["images"] & there["masks"])
 
 
 class HumanNerfCapture(CaptureFolder):
@@ -112,13 +96,14 @@ class HumanNerfCapture(CaptureFolder):
         """The camera of its first frame, with its lens distortion; all frames of one share it."""
         self.check_index(camera, 0)
         own = self.camera_ids[camera]
-        name = self._names[own, min(frame for other, frame in self._names if other == own)]
+        first = min(frame for other, frame in self._names if other == own)
+        name = self._names[own, first]
         entry, path = self._cameras[name], self.folder / "cameras.pkl"
         K = _numbers(entry, "intrinsics", (3, 3), path, name)
         E = _numbers(entry, "extrinsics", (4, 4), path, name)
         D = _numbers(entry, "distortions", (5,), path, name) if "distortions" in entry else None
         if camera not in self._sizes:
-            self._sizes[camera] = size_of(self._picture("images", name))
+            self._sizes[camera] = size_of(self.picture("images", camera, first))
         return Camera.from_opencv(K, E[:3, :3], E[:3, 3], *self._sizes[camera], D)
 
     def body_pose(self, frame: int) -> BodyPose:
@@ -155,6 +140,11 @@ class HumanNerfCapture(CaptureFolder):
         found = _dictionary(path) if path.is_file() else {}
         return _numbers(found, "avg_betas", None, path, "") if "avg_betas" in found else None
 
+    @property
+    def views(self) -> list[View]:
+        """(camera, frame) of the views that the copy lists, sorted."""
+        return sorted((self.camera_ids.index(camera), frame) for camera, frame in self._names)
+
     def image(self, camera: int, frame: int) -> NDArray[np.uint8]:
         """[H, W, 3] RGB, as stored."""
         return self._read("images", camera, frame, read_rgb)
@@ -167,40 +157,23 @@ class HumanNerfCapture(CaptureFolder):
 
     def content_digest(self, camera: int, frame: int, source: str = "mask") -> bytes:
         digest = hashlib.sha256()
-        name = self._names.get((self.camera_ids[camera], frame))
-        for kind in ("images", "masks"):
-            path = None if name is None else self._picture(kind, name)
-            digest.update(path.read_bytes() if path is not None and path.is_file() else b"")
+        if (self.camera_ids[camera], frame) in self._names:
+            for path in self.files_of(camera, frame, source):
+                digest.update(path.read_bytes() if path.is_file() else b"")
         return digest.digest()
 
     def files_of(self, camera: int, frame: int, source: str) -> tuple[Path, ...]:
-        name = self._names.get((self.camera_ids[camera], frame))
-        if name is None:
-            raise BadInput(f"{self.folder}: no frame {frame} of camera {self.camera_ids[camera]}")
-        return self._picture("images", name), self._picture("masks", name)
+        return self.picture("images", camera, frame), self.picture("masks", camera, frame)
 
-    def has(self, camera: int, frame: int) -> bool:
-        """Whether the copy lists this view."""
-        return (self.camera_ids[camera], frame) in self._names
-
-    def _read(self, kind: str, camera: int, frame: int, read: Callable[[Path], NDArray]) -> NDArray:
+    def _read(self, kind: str, camera: int, frame: int, read: Callable[[Path], Picture]) -> Picture:
         self.check_index(camera, frame)
+        return self.read_picture(self.picture(kind, camera, frame), camera, read, "cameras.pkl lists it")
+
+    def picture(self, kind: str, camera: int, frame: int) -> Path:
+        """The file of a view in images/ or masks/. Raises `BadInput` for a view that the copy does not list."""
         name = self._names.get((self.camera_ids[camera], frame))
         if name is None:
             raise BadInput(f"{self.folder}: no frame {frame} of camera {self.camera_ids[camera]} in cameras.pkl")
-        path = self._picture(kind, name)
-        if not path.is_file():
-            raise missing_file(path, "cameras.pkl lists it")
-        picture = read(path)
-        size = self.camera(camera)
-        if picture.shape[:2] != (size.height, size.width):
-            raise BadInput(
-                f"{path}: {picture.shape[1]}×{picture.shape[0]} px, expected {size.width}×{size.height} px as the "
-                f"camera's first image"
-            )
-        return picture
-
-    def _picture(self, kind: str, name: str) -> Path:
         png = self.folder / kind / f"{name}.png"
         jpg = png.with_suffix(".jpg")
         return jpg if kind == "images" and not png.is_file() and jpg.is_file() else png
@@ -235,59 +208,6 @@ def _numbers(entry: Any, key: str, shape: tuple[int, ...] | None, path: Path, na
     if not np.isfinite(value).all():
         raise BadInput(f"{wanted}, found NaN or infinity in it")
     return value
-
-
-# ----------------------------------------------------------------------------------------------- check
-
-
-def check(dataset: HumanNerfFormat, body: Body | None = None, samples: int = 4) -> dict[str, Any]:
-    """What a copy is and lacks, for `ihbench data check`."""
-    subjects = []
-    for name in dataset.subjects():
-        problems: list[str] = []
-        found: dict[str, Any] = {"subject": name, "problems": problems, "warnings": []}
-        try:
-            capture = dataset.open(name, _fitting(dataset, name, body))
-            views = sorted((c, f) for c in range(len(capture.camera_ids)) for f in range(capture.n_frames)
-                           if capture.has(c, f))  # fmt: skip
-            missing = {
-                kind: sum(not capture._picture(kind, capture._names[capture.camera_ids[c], f]).is_file()
-                          for c, f in views)
-                for kind in ("images", "masks")
-            }  # fmt: skip
-            found |= {
-                "standin": capture.standin, "body": capture.body, "variant": capture.variant,
-                "cameras": len(capture.camera_ids), "frames": capture.n_frames, "views": len(views),
-                "missing": missing,
-            }  # fmt: skip
-            problems += [f"{n} of {kind} missing" for kind, n in missing.items() if n]
-            _examine(capture, [view for view in views if not capture.lacks(*view)], samples, found)
-        except BadInput as error:
-            problems.append(str(error))
-        subjects.append(found)
-    return {
-        "dataset": "zju_mocap",
-        "layout": "humannerf",
-        "root": str(dataset.root),
-        "standin": next((s["standin"] for s in subjects if s.get("standin")), ""),
-        "subjects": subjects,
-        "ok": not any(s["problems"] for s in subjects),
-    }
-
-
-def _fitting(dataset: HumanNerfFormat, name: str, body: Body | None) -> Body | None:
-    """The body given, unless the copy is a stand-in, which has its own."""
-    return None if dataset.open(name).standin else body
-
-
-def _examine(capture: HumanNerfCapture, views: list[tuple[int, int]], samples: int, found: dict[str, Any]) -> None:
-    model = capture.model if capture.has_model else None
-
-    def outline(frame: int) -> Outline:
-        assert model is not None
-        return Outline(model.pose(capture.body_pose(frame)), model.faces)
-
-    examine(capture, views, found, whole=True, outline=outline if model else None, samples=samples)
 
 
 # ----------------------------------------------------------------------------------------------- write

@@ -15,7 +15,7 @@ from __future__ import annotations
 import hashlib
 import io
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -28,14 +28,15 @@ from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera, off_orthogonal
 from ihbench.datasets.reading.capture_folder import BY_OPTIONS, CaptureFolder
 from ihbench.datasets.reading.pickles import write_object
-from ihbench.datasets.reading.plausibility import Outline, examine
+from ihbench.datasets.reading.plausibility import Outline
+from ihbench.datasets.reading.subject_folders import SubjectFolders, View, count_files
 from ihbench.errors import BadInput
 from ihbench.files import atomic
-from ihbench.files.paths import user_path
 from ihbench.files.pictures import encoded, read_mask, read_rgb, size_of
 from ihbench.files.safe_pickle import load_npy
 from ihbench.files.spelling import missing_file
 from ihbench.registry import nearest
+from ihbench.scene.copy_report import SubjectReport
 
 FOLDER_PREFIX = "CoreView_"
 FITS = ("new_params", "params")  # the newer one first: HumanNeRF and OccNeRF use it
@@ -44,49 +45,51 @@ CAMERA_SHAPES = {"K": (3, 3), "D": (5,), "R": (3, 3), "T": (3,)}
 JPEG_QUALITY = 95
 
 
-class ZjuMocap:
-    """A folder that holds `CoreView_*` folders, or one of those folders itself."""
+class ZjuMocap(SubjectFolders["ZjuCapture"]):
+    """A folder that holds `CoreView_*` folders, or one of those folders itself. Names are without `CoreView_`."""
 
-    prefix = FOLDER_PREFIX
-
-    def __init__(self, root: Path):
-        """Raises `BadInput` when there is no such folder, or nothing of this layout in it."""
-        self.root = user_path(root)
-        if not self.root.is_dir():
-            raise BadInput(f"{self.root}: no such folder; give the folder that holds {self.prefix}* folders")
-        own_name = self.root.absolute().name  # "." may be a subject's folder
-        if own_name.startswith(self.prefix):
-            self._folders = {own_name.removeprefix(self.prefix): self.root.absolute()}
-        else:
-            self._folders = {
-                folder.name.removeprefix(self.prefix): folder
-                for folder in self.root.glob(f"{self.prefix}*")
-                if folder.is_dir() and (self.prefix == FOLDER_PREFIX or (folder / "annots.npy").is_file())
-            }
-        if not self._folders:
-            raise BadInput(f"{self.root}: no {self.prefix}* folder in it{_where_else(self.root)}")
+    dataset, layout = "zju_mocap", "original"
+    content = f"{FOLDER_PREFIX}* folders"
 
     @staticmethod
-    def check(root: Path, body: Body | None = None) -> dict[str, Any]:
-        """What this copy is and what it lacks; see `check` below."""
-        return check(ZjuMocap(root), "original", body)
+    def holds(folder: Path) -> bool:
+        return folder.name.startswith(FOLDER_PREFIX)
+
+    def name_of(self, folder: Path) -> str:
+        return folder.name.removeprefix(FOLDER_PREFIX)
+
+    def other_layout(self) -> str:
+        repack = any(path.is_dir() for path in self.root.glob("my_[0-9]*"))
+        return "this looks like the ZJU-MoCap-refine repack (my_*), " if repack else ""
 
     def subjects(self) -> list[str]:
-        """Names without `CoreView_`, in natural order."""
+        """Names in natural order."""
         return sorted(self._folders, key=_natural)
 
-    def open(self, subject: str, body: Body | None = None) -> ZjuCapture:
-        """One subject. Reads annots.npy only.
+    def capture(self, subject: str, body: Body | None) -> ZjuCapture:
+        return ZjuCapture(self._folders[subject], body)
 
-        `body` is the SMPL model the parameters belong to; without it a real capture opens, but `body_pose` raises.
-        Stand-ins take the bench's own body by themselves. Raises `BadInput` for an unknown subject or a damaged one.
-        """
-        if subject not in self._folders:
-            raise BadInput(f"{self.root}: no subject {subject!r}: {nearest(subject, self.subjects())}")
-        return self._capture(self._folders[subject], body)
+    def inspect(self, capture: ZjuCapture, report: SubjectReport) -> list[View]:
+        views = [(camera, frame) for camera in range(len(capture.camera_ids)) for frame in range(capture.n_frames)]
+        kinds = {kind: {view: capture.mask_path(*view, kind) for view in views} for kind in capture.mask_kinds}
+        kinds = {"image": {view: capture.image_path(*view) for view in views}, **kinds}
+        for part in (capture.fit, vertex_folder(capture.fit)):
+            numbers = ((frame, capture.number(frame)) for frame in range(capture.n_frames))
+            kinds[part] = {(0, frame): capture.folder / part / f"{number}.npy" for frame, number in numbers}
+        there = count_files(report, kinds, may_lack=("mask_cihp",))
+        report.files = {kind: count for kind, count in report.files.items() if kind in ("image", *capture.mask_kinds)}
+        return sorted(there["image"] & there["mask"])
 
-    def _capture(self, folder: Path, body: Body | None) -> ZjuCapture:
-        return ZjuCapture(folder, body)
+    def bodies(self, capture: ZjuCapture, report: SubjectReport) -> tuple[Callable[[int], Outline], bool]:
+        """The posed model where it is at hand, else the stored vertices."""
+
+        def outline(frame: int) -> Outline:
+            read_params(capture.params_path(frame))
+            if capture.has_model:
+                return Outline(capture.model.pose(capture.body_pose(frame)), capture.model.faces)
+            return Outline(capture.vertices(frame))
+
+        return outline, True
 
 
 class ZjuCapture(CaptureFolder):
@@ -100,12 +103,12 @@ class ZjuCapture(CaptureFolder):
     def __init__(self, folder: Path, body: Body | None = None):
         super().__init__(folder, folder.name.removeprefix(self.prefix), body)
         self._annots = read_annots(folder / "annots.npy")
-        self.fit = next((name for name in self.fits if (folder / name).is_dir()), None)
-        if self.fit is None:
+        fit = next((name for name in self.fits if (folder / name).is_dir()), None)
+        if fit is None:
             raise BadInput(
                 f"{folder}: neither {' nor '.join(self.fits)} in it; expected SMPL parameters, one file a frame"
             )
-        self.variant = f"{self.layout}/{self.fit}"
+        self.fit, self.variant = fit, f"{self.layout}/{fit}"
         self.n_frames = len(self._annots.image_paths)
         self.camera_ids = self._annots.camera_ids
         self._sizes: dict[int, tuple[int, int]] = {}
@@ -113,7 +116,7 @@ class ZjuCapture(CaptureFolder):
     def camera(self, camera: int) -> Camera:
         """The calibrated view with its lens distortion; its size comes from the header of one of its images."""
         self.check_index(camera, 0)
-        width, height = self._image_size(camera)
+        width, height = self.image_size(camera)
         K, D, R, T = (self._annots.cameras[key][camera] for key in CAMERA_SHAPES)
         return Camera.from_opencv(K, R, T / 1000, width, height, D)
 
@@ -129,7 +132,6 @@ class ZjuCapture(CaptureFolder):
 
     def vertices(self, frame: int) -> NDArray[np.float64]:
         """[V, 3] m, world: the fitted body mesh as stored."""
-        assert self.fit is not None
         path = self.folder / vertex_folder(self.fit) / f"{self.number(frame)}.npy"
         if not path.is_file():
             raise missing_file(path, f"expected the body's vertices at frame {frame}")
@@ -142,10 +144,7 @@ class ZjuCapture(CaptureFolder):
 
     def image(self, camera: int, frame: int) -> NDArray[np.uint8]:
         """[H, W, 3] RGB, as stored."""
-        path = self.image_path(camera, frame)
-        image = self._read_picture(path, read_rgb)
-        self._check_size(path, image, camera)
-        return image
+        return self.read_picture(self.image_path(camera, frame), camera, read_rgb, "annots.npy lists it")
 
     def silhouette(self, camera: int, frame: int, source: str = "mask") -> NDArray[np.bool_]:
         """[H, W]. `source` is "mask", "mask_cihp" or "union" (either of the two, as HumanNeRF and OccNeRF)."""
@@ -154,8 +153,7 @@ class ZjuCapture(CaptureFolder):
         person = None
         for kind in SILHOUETTES[source]:
             path = self.mask_path(camera, frame, kind)
-            here = self._read_picture(path, lambda path: read_mask(path, "non-zero"))
-            self._check_size(path, here, camera)
+            here = self.read_picture(path, camera, lambda path: read_mask(path, "non-zero"), "annots.npy lists it")
             person = here if person is None else person | here
         assert person is not None
         return person
@@ -193,10 +191,9 @@ class ZjuCapture(CaptureFolder):
         return self.folder / kind / PurePosixPath(self._annots.image_paths[frame][camera]).with_suffix(".png")
 
     def params_path(self, frame: int) -> Path:
-        assert self.fit is not None
         return self.folder / self.fit / f"{self.number(frame)}.npy"
 
-    def _image_size(self, camera: int) -> tuple[int, int]:
+    def image_size(self, camera: int) -> tuple[int, int]:
         """(width, height) px of the camera's first image on disk."""
         if camera not in self._sizes:
             paths = (self.image_path(camera, frame) for frame in range(self.n_frames))
@@ -207,20 +204,6 @@ class ZjuCapture(CaptureFolder):
                 raise BadInput(f"{folder}: {state}; expected the images of camera {camera}{self.standin_hint}")
             self._sizes[camera] = size_of(path)
         return self._sizes[camera]
-
-    def _read_picture(self, path: Path, read: Callable[[Path], NDArray]) -> NDArray:
-        if not path.is_file():
-            missing = "file" if path.parent.is_dir() else f"file, nor its folder {path.parent.name}"
-            raise missing_file(path, f"annots.npy lists it{self.standin_hint}", f"no such {missing}")
-        return read(path)
-
-    def _check_size(self, path: Path, picture: NDArray, camera: int) -> None:
-        width, height = self._image_size(camera)
-        if picture.shape[:2] != (height, width):
-            raise BadInput(
-                f"{path}: {picture.shape[1]}×{picture.shape[0]} px, but the camera's images are {width}×{height} px; "
-                f"expected one size for a camera's images and masks"
-            )
 
 
 def vertex_folder(fit: str) -> str:
@@ -346,15 +329,6 @@ def _frame_number(image: str, folder: Path) -> int:
     return int(number)
 
 
-def _where_else(root: Path) -> str:
-    below = next((path.parent for path in sorted(root.glob(f"*/{FOLDER_PREFIX}*"))), None)
-    if below is not None:
-        return f"; there is one in {below}, give that folder"
-    if any(path.is_dir() for path in root.glob("my_[0-9]*")):
-        return "; this looks like the ZJU-MoCap-refine repack (my_*), expected the original release"
-    return "; expected the original ZJU-MoCap release, unpacked"
-
-
 def _natural(name: str) -> list[tuple[int, int | str]]:
     return [(0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", name) if part]
 
@@ -367,83 +341,6 @@ def _described(value: object) -> str:
 
 def _shape_of(array: NDArray) -> str:
     return f"a {array.dtype} array of shape {list(array.shape)}"
-
-
-# ----------------------------------------------------------------------------------------------- check
-
-
-def check(dataset: ZjuMocap, layout: str, body: Body | None = None, samples: int = 3) -> dict[str, Any]:
-    """What this copy is and what it lacks, for `ihbench data check`.
-
-    Lists folders and decodes `samples` frames of two cameras a subject; it does not decode everything. Raises
-    `BadInput` when the root is not of this layout at all; what is wrong with a subject is listed in its "problems".
-    `vertices_in_mask` is the share of body vertices that project into the person's silhouette (grown by 1 % of the
-    image's width), over the sampled images: well below 0.95 means wrong cameras, units or parameters.
-    """
-    subjects = [_check_subject(dataset, name, body, samples) for name in dataset.subjects()]
-    return {
-        "dataset": ZjuCapture.dataset,
-        "layout": layout,
-        "root": str(dataset.root),
-        "standin": next((subject["standin"] for subject in subjects if subject.get("standin")), ""),
-        "subjects": subjects,
-        "ok": not any(subject["problems"] for subject in subjects),
-    }
-
-
-def _check_subject(dataset: ZjuMocap, name: str, body: Body | None, samples: int) -> dict[str, Any]:
-    problems: list[str] = []
-    found: dict[str, Any] = {"subject": name, "problems": problems, "warnings": []}
-    try:
-        capture = dataset.open(name)
-        if body is not None and not capture.standin:
-            capture = dataset.open(name, body)
-    except BadInput as error:
-        problems.append(str(error))
-        return found
-    n_cameras, n_frames = len(capture.camera_ids), capture.n_frames
-    pairs = [(camera, frame) for camera in range(n_cameras) for frame in range(n_frames)]
-    kinds = ("image", *capture.mask_kinds)
-    present: dict[str, set[tuple[int, int]]] = {}
-    for kind in kinds:
-        path_of = capture.image_path if kind == "image" else lambda c, f, kind=kind: capture.mask_path(c, f, kind)
-        listed = _listing({path_of(camera, 0).parent for camera in range(n_cameras)})
-        present[kind] = {pair for pair in pairs if path_of(*pair) in listed}
-    params = _listing({capture.folder / part for part in (*capture.fits, *map(vertex_folder, capture.fits))})
-    numbers = [f"{capture.number(frame)}.npy" for frame in range(n_frames)]
-    assert capture.fit is not None
-    missing = {kind: len(pairs) - len(present[kind]) for kind in kinds}
-    for part in (capture.fit, vertex_folder(capture.fit)):
-        missing[part] = sum(capture.folder / part / number not in params for number in numbers)
-    found |= {
-        "standin": capture.standin,
-        "body": capture.body,
-        "variant": capture.variant,
-        "cameras": n_cameras,
-        "frames": n_frames,
-        "files": {kind: len(present[kind]) for kind in kinds},
-        "missing": missing,
-    }
-    complete = sorted(present["image"] & present["mask"])
-    if not capture.standin:
-        problems += [f"{n} of {what} missing" for what, n in missing.items() if n and what != "mask_cihp"]
-    if complete:
-        examine(capture, complete, found, whole=True, outline=lambda frame: _outline(capture, frame), samples=samples)
-    else:
-        problems.append("no image with its mask found")
-    return found
-
-
-def _listing(folders: Iterable[Path]) -> set[Path]:
-    return {path for folder in folders if folder.is_dir() for path in folder.iterdir()}
-
-
-def _outline(capture: ZjuCapture, frame: int) -> Outline:
-    """The frame's body: posed where the model is at hand, else its stored vertices."""
-    read_params(capture.params_path(frame))
-    if capture.has_model:
-        return Outline(capture.model.pose(capture.body_pose(frame)), capture.model.faces)
-    return Outline(capture.vertices(frame))
 
 
 # ----------------------------------------------------------------------------------------------- write

@@ -13,7 +13,6 @@ the record names the variant.
 from __future__ import annotations
 
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,14 +31,21 @@ PARAMS = "smpl_params"
 class ZjuRefine(ZjuMocap):
     """A folder that holds `my_*` folders, or one of those folders itself."""
 
-    prefix = PREFIX
+    layout = "refine"
+    content = f"{PREFIX}* folders with annots.npy"
 
     @staticmethod
-    def check(root: Path, body: Body | None = None) -> dict[str, Any]:
-        return zju_mocap.check(ZjuRefine(root), "refine", body)
+    def holds(folder: Path) -> bool:
+        return folder.name.startswith(PREFIX) and (folder / "annots.npy").is_file()
 
-    def _capture(self, folder: Path, body: Body | None) -> ZjuCapture:
-        return ZjuRefineCapture(folder, body)
+    def name_of(self, folder: Path) -> str:
+        return folder.name.removeprefix(PREFIX)
+
+    def other_layout(self) -> str:
+        return ""
+
+    def capture(self, subject: str, body: Body | None) -> ZjuCapture:
+        return ZjuRefineCapture(self._folders[subject], body)
 
 
 class ZjuRefineCapture(ZjuCapture):

@@ -73,15 +73,15 @@ def _check(chosen: Check) -> int:
     complaints = []
     for name in registry.names("dataset"):
         try:
-            found = registry.load("dataset", name).check(folder, body)
+            report = registry.load("dataset", name).check(folder, body)
         except BadInput as error:
             if is_about_a_file(error, folder):
                 raise
             complaints.append(f"{name}: {error}")
             continue
-        add_fitness(found, folder, body, chosen.overlays)
-        print(json.dumps(found) if chosen.json else "\n".join(_lines(found)))
-        return 0 if found["ok"] else 1
+        add_fitness(report, folder, body, chosen.overlays)
+        print(json.dumps(report.as_json()) if chosen.json else "\n".join(_lines(report.as_json())))
+        return 0 if report.ok else 1
     other = folder_nearby(folder, registry.names("dataset"))
     if other is not None:
         raise BadInput(f"data folder {folder}: no known layout; did you mean {other}?")

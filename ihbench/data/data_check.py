@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ihbench import registry
 from ihbench.errors import BadInput
+from ihbench.files.pictures import encoded
 from ihbench.record import outputs
 from ihbench.scene.contracts import Capture
+from ihbench.scene.copy_report import CopyReport
 from ihbench.scene.protocol import Protocol, load_protocol
 
 if TYPE_CHECKING:
@@ -83,13 +85,11 @@ def _outlined(
     return out
 
 
-def add_fitness(found: dict[str, Any], root: Path, body: Body | None, named: Path | None) -> None:
-    """Extend a check's result: per subject "protocols" (name -> fitness) and "overlay" (a file, or why none).
+def add_fitness(report: CopyReport, root: Path, body: Body | None, named: Path | None) -> None:
+    """Extend the report of a check: per subject which protocols it serves, and the path of its overlay.
 
     `named` is the folder for overlays, None for the usual one.
     """
-    from ihbench.files.pictures import encoded
-
     no_place = ""
     overlays = OVERLAYS if named is None else named
     try:
@@ -100,32 +100,31 @@ def add_fitness(found: dict[str, Any], root: Path, body: Body | None, named: Pat
         if named is not None:
             raise BadInput(f"--overlays {named}: lies in the data folder, which is never written to; name another")
         no_place = "none: the current folder is in the data folder, never written to; name one with --overlays"
-    protocols = protocols_of(found["dataset"])
-    source = registry.load("dataset", found["dataset"])(root)
-    for subject in found["subjects"]:
+    protocols = protocols_of(report.dataset)
+    source = registry.load("dataset", report.dataset)(root)
+    for subject in report.subjects:
         try:
-            capture = source.open(subject["subject"])
-            subject["protocols"] = {protocol.name: fitness(capture, protocol) for protocol in protocols}
+            capture = source.open(subject.subject)
+            subject.protocols = {protocol.name: fitness(capture, protocol) for protocol in protocols}
             if no_place:
-                subject["overlay"] = no_place
+                subject.overlay = no_place
                 continue
             if capture.body == "smpl" and body is None:
-                subject["overlay"] = "none: needs the SMPL model file, name it with --body or IHBENCH_BODY"
+                subject.overlay = "none: needs the SMPL model file, name it with --body or IHBENCH_BODY"
                 continue
             if capture.body == "smpl":
-                capture = source.open(subject["subject"], body=body)
+                capture = source.open(subject.subject, body=body)
             picture = overlay(capture, capture.model, protocols[0].subjects.silhouette if protocols else "mask")
         except BadInput as error:
-            if not subject["problems"]:
-                subject["problems"].append(str(error))
-                found["ok"] = False
+            if not subject.problems:
+                subject.problem(str(error))
             continue
         if picture is None:
-            subject["overlay"] = "none: no frame has image, mask and pose"
+            subject.overlay = "none: no frame has image, mask and pose"
             continue
-        path = overlays / f"{subject['subject']}.png"
+        path = overlays / f"{subject.subject}.png"
         try:
             outputs.write_bytes(path, encoded(picture, "PNG", compress_level=1), durable=False)
-            subject["overlay"] = str(path)
+            subject.overlay = str(path)
         except (BadInput, OSError) as error:  # the check is worth having without a picture
-            subject["overlay"] = no_place = f"none: {error}; name another folder with --overlays"
+            subject.overlay = no_place = f"none: {error}; name another folder with --overlays"

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from ihbench.body import Body
     from ihbench.clock.ledger import Ledger
     from ihbench.clock.progress import Progress
+    from ihbench.scene.copy_report import CopyReport
 
 
 class MaskState(IntEnum):
@@ -116,9 +117,9 @@ class Dataset(Protocol):
     def __init__(self, root: Path): ...
 
     @staticmethod
-    def check(root: Path, body: Body | None = None) -> dict[str, Any]:
-        """What a folder holds and lacks, as plain data with a boolean "ok"; with a body model also whether its poses
-        fit the masks. Raises `BadInput` for another layout."""
+    def check(root: Path, body: Body | None = None) -> CopyReport:
+        """What a folder holds and lacks; with a body model also whether its poses fit the masks. Raises `BadInput`
+        for another layout."""
         ...
 
     def subjects(self) -> list[str]: ...

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ihbench.errors import BadInput
 from ihbench.files.paths import user_path
@@ -13,6 +13,7 @@ from ihbench.scene.contracts import Dataset
 
 if TYPE_CHECKING:
     from ihbench.body import Body
+    from ihbench.scene.copy_report import CopyReport
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class LayoutChoice:
     def __call__(self, root: Path) -> Dataset:
         return self._find(root)(root)
 
-    def check(self, root: Path, body: Body | None = None) -> dict[str, Any]:
+    def check(self, root: Path, body: Body | None = None) -> CopyReport:
         """What a folder holds and lacks. `body` is the user's SMPL model, with which poses are held against masks.
 
         Raises `BadInput` when it has none of the layouts.

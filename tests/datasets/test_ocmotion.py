@@ -429,10 +429,10 @@ def test_standin_takes_its_own_body_and_may_lack_images(sequence):
     with pytest.raises(BadInput, match=r"images/00321.png: no such file.*a stand-in holds only"):
         capture.image(0, 1)
     found = OcMotionW2a.check(sequence.parent)
-    assert found["ok"]
-    (subject,) = found["subjects"]
-    assert subject["missing"] == {"image": 1, "mask": 0}
-    assert subject["mask_on_body"] > 0.95
+    assert found.ok
+    (subject,) = found.subjects
+    assert subject.missing == {"image": 1, "mask": 0}
+    assert subject.mask_on_body > 0.95
 
 
 # --------------------------------------------------------------------------------------- w2a: bad input
@@ -452,7 +452,7 @@ def test_the_layouts_do_not_take_each_others_folders(w2a, original, tmp_path):
         with pytest.raises(BadInput, match="looks like `_w2a` sequences"):
             OcMotionOriginal(root)
     for layout in (OcMotionW2a, OcMotionOriginal):
-        with pytest.raises(BadInput, match="unpacked"):
+        with pytest.raises(BadInput, match="expected"):
             layout(tmp_path)
         with pytest.raises(BadInput):
             layout.check(tmp_path)
@@ -481,8 +481,8 @@ def test_metadata_that_is_not_json_of_frames(sequence, text):
     with pytest.raises(BadInput, match=r"metadata.json: (not valid JSON|expected one dictionary)") as error:
         opened(sequence)
     message(error)
-    (subject,) = ocmotion_w2a.check(sequence.parent)["subjects"]
-    assert "metadata.json" in subject["problems"][0]
+    (subject,) = OcMotionW2a.check(sequence.parent).subjects
+    assert "metadata.json" in subject.problems[0]
 
 
 def test_metadata_missing_or_not_utf8(sequence):
@@ -527,9 +527,9 @@ def test_metadata_without_image(sequence):
     """A lost image would shift every later position, one at the end shortens the sequence."""
     (sequence / "images" / "00323.png").unlink()
     assert opened(sequence).n_frames == N_FRAMES - 1
-    (subject,) = ocmotion_w2a.check(sequence.parent)["subjects"]
-    assert subject["missing"]["image"] == 1
-    assert any("metadata.json has 1 frames before or after the images" in line for line in subject["warnings"])
+    (subject,) = OcMotionW2a.check(sequence.parent).subjects
+    assert subject.missing["image"] == 1
+    assert any("metadata.json has 1 frames before or after the images" in line for line in subject.warnings)
     (sequence / "images" / "00321.png").unlink()
     with pytest.raises(BadInput, match=r"images/00321.png: no such file, one of 1 that metadata.json has within"):
         opened(sequence)
@@ -602,8 +602,8 @@ def test_camera_that_moves(sequence, key, scale):
         return
     with pytest.raises(BadInput, match=r"frame 00322: its camera differs from the first frame's by 0.0003"):
         opened(sequence)
-    (subject,) = ocmotion_w2a.check(sequence.parent)["subjects"]
-    assert "one fixed camera" in subject["problems"][0]
+    (subject,) = OcMotionW2a.check(sequence.parent).subjects
+    assert "one fixed camera" in subject.problems[0]
 
 
 @pytest.mark.parametrize(
@@ -631,8 +631,8 @@ def test_bad_body_parameters(sequence, key, value, expected):
     with pytest.raises(BadInput, match=expected) as error:
         capture.body_pose(2)
     assert "metadata.json: frame 00322" in message(error)
-    (subject,) = ocmotion_w2a.check(sequence.parent)["subjects"]
-    assert len([problem for problem in subject["problems"] if "frame 00322" in problem]) == 1
+    (subject,) = OcMotionW2a.check(sequence.parent).subjects
+    assert len([problem for problem in subject.problems if "frame 00322" in problem]) == 1
 
 
 @pytest.mark.parametrize("name", ["mesh_infos.pkl", "all_cameras.pkl"])
@@ -643,8 +643,8 @@ def test_truncated_pickle(sequence, name, keep):
     with pytest.raises(BadInput, match="cannot be read as a pickle") as error:
         read_pickles(sequence)
     assert name in message(error)
-    (subject,) = ocmotion_w2a.check(sequence.parent)["subjects"]
-    assert any(name in problem for problem in subject["problems"])
+    (subject,) = OcMotionW2a.check(sequence.parent).subjects
+    assert any(name in problem for problem in subject.problems)
 
 
 @pytest.mark.parametrize("name", ["mesh_infos.pkl", "all_cameras.pkl"])
@@ -706,10 +706,10 @@ def test_mask_missing(sequence):
     with pytest.raises(BadInput, match=r"masks/00322.png: no such file; expected the visible mask") as error:
         opened(sequence).silhouette(0, 2)
     message(error)
-    found = ocmotion_w2a.check(sequence.parent)
-    assert not found["ok"]
-    assert found["subjects"][0]["missing"] == {"image": 0, "mask": 1}
-    assert "1 of mask missing" in found["subjects"][0]["problems"]
+    found = OcMotionW2a.check(sequence.parent)
+    assert not found.ok
+    assert found.subjects[0].missing == {"image": 0, "mask": 1}
+    assert "1 of mask missing" in found.subjects[0].problems
 
 
 @pytest.mark.parametrize("name", ["images/00321.png", "masks/00321.png"])
@@ -736,7 +736,7 @@ def test_symlink_loops_do_no_harm(sequence, release):
     capture.content_digest(0, 1)
     with pytest.raises(BadInput, match=r"00321.png: no such file"):
         capture.image(0, 1)
-    assert not ocmotion_w2a.check(sequence.parent)["ok"]
+    assert not OcMotionW2a.check(sequence.parent).ok
     assert OcMotionOriginal(release).subjects() == ["0011_01", "0011_01_p1", "0011_02"]
     for root, layout in ((release, OcMotionW2a), (sequence.parent, OcMotionOriginal)):
         with pytest.raises(BadInput):
@@ -768,22 +768,22 @@ def test_real_data_needs_an_smpl_body(w2a):
 
 def test_check_of_a_sound_sequence(w2a, smpl):
     found = OcMotionW2a.check(w2a.root, smpl)
-    (subject,) = found["subjects"]
-    assert (found["dataset"], found["layout"], found["standin"], found["ok"]) == ("ocmotion", "w2a", "", True)
-    assert (subject["subject"], subject["variant"], subject["body"]) == (NAME, "w2a", "smpl")
-    assert (subject["cameras"], subject["frames"], subject["problems"]) == (1, N_FRAMES, [])
-    assert subject["files"] == {"image": N_FRAMES, "mask": N_FRAMES}
-    assert subject["missing"] == {"image": 0, "mask": 0}
-    assert (subject["sampled_images"], subject["image_size"]) == (3, [[WIDTH, HEIGHT]])
-    assert subject["mask_on_body"] > 0.99
-    assert subject["vertices_in_mask"] < 0.9  # the furniture hides the rest
-    json.dumps(found)
+    (subject,) = found.subjects
+    assert (found.dataset, found.layout, found.standin, found.ok) == ("ocmotion", "w2a", "", True)
+    assert (subject.subject, subject.variant, subject.body) == (NAME, "w2a", "smpl")
+    assert (subject.cameras, subject.frames, subject.problems) == (1, N_FRAMES, [])
+    assert subject.files == {"image": N_FRAMES, "mask": N_FRAMES}
+    assert subject.missing == {"image": 0, "mask": 0}
+    assert (subject.sampled_images, subject.image_size) == (3, [[WIDTH, HEIGHT]])
+    assert subject.mask_on_body > 0.99
+    assert subject.vertices_in_mask < 0.9  # the furniture hides the rest
+    json.dumps(found.as_json())
 
 
 def test_check_without_a_body_says_nothing_about_the_masks(w2a):
-    (subject,) = OcMotionW2a.check(w2a.root)["subjects"]
-    assert subject["problems"] == []
-    assert "mask_on_body" not in subject
+    (subject,) = OcMotionW2a.check(w2a.root).subjects
+    assert subject.problems == []
+    assert subject.mask_on_body is None
 
 
 @pytest.mark.parametrize(
@@ -799,17 +799,17 @@ def test_check_names_masks_that_do_not_fit(sequence, w2a, smpl, change, expected
     for name, mask in zip(NAMES, w2a.masks, strict=True):
         ocmotion_w2a.write_frame(sequence, name, None, change(mask))
     found = OcMotionW2a.check(sequence.parent, smpl)
-    assert not found["ok"]
-    (problem,) = found["subjects"][0]["problems"]
+    assert not found.ok
+    (problem,) = found.subjects[0].problems
     assert expected in problem
 
 
 def test_check_notices_poses_of_other_frames(sequence, w2a, smpl):
     moved = [dataclasses.replace(pose, transl=pose.transl - np.array([0.5, 0, 0])) for pose in w2a.poses]
     ocmotion_w2a.write_sequence_metadata(sequence, NAMES, w2a.cameras[OWN], moved)
-    (subject,) = OcMotionW2a.check(sequence.parent, smpl)["subjects"]
-    assert subject["mask_on_body"] < 0.9
-    assert len(subject["problems"]) == 1
+    (subject,) = OcMotionW2a.check(sequence.parent, smpl).subjects
+    assert subject.mask_on_body < 0.9
+    assert len(subject.problems) == 1
 
 
 # --------------------------------------------------------------------------------- the original release
@@ -1004,8 +1004,8 @@ def test_bad_annotations_of_one_subject(release, damage, expected):
     with pytest.raises(BadInput, match=expected) as error:
         dataset.open("0011_02")
     assert "train.pkl" in message(error)
-    subject = next(s for s in ocmotion.check(release)["subjects"] if s["subject"] == "0011_02")
-    assert len(subject["problems"]) == 1
+    subject = next(s for s in OcMotionOriginal.check(release).subjects if s.subject == "0011_02")
+    assert len(subject.problems) == 1
 
 
 @pytest.mark.parametrize(
@@ -1026,8 +1026,8 @@ def test_annotations_of_another_structure(release, content, expected):
         OcMotionOriginal(release).subjects()
     message(error)
     found = OcMotionOriginal.check(release)
-    assert not found["ok"]
-    assert "train.pkl" in found["subjects"][0]["problems"][0]
+    assert not found.ok
+    assert "train.pkl" in found.subjects[0].problems[0]
 
 
 def test_two_cameras_in_one_folder(release):
@@ -1088,19 +1088,19 @@ def test_check_of_the_original_release(release, original, smpl, flip, expected):
     for frame, mask in enumerate(original.masks):
         ocmotion.write_frame(release, path_of(OWN, frame), None, mask[:, ::-1] if flip else mask)
     found = OcMotionOriginal.check(release, smpl)
-    (subject,) = found["subjects"]
-    assert (found["dataset"], found["layout"], found["ok"]) == ("ocmotion", "original", not flip)
-    assert (subject["subject"], subject["variant"], subject["frames"]) == ("0011_02", "original", N_FRAMES)
-    assert all(expected in problem for problem in subject["problems"])
-    assert len(subject["problems"]) == flip
-    json.dumps(found)
+    (subject,) = found.subjects
+    assert (found.dataset, found.layout, found.ok) == ("ocmotion", "original", not flip)
+    assert (subject.subject, subject.variant, subject.frames) == ("0011_02", "original", N_FRAMES)
+    assert all(expected in problem for problem in subject.problems)
+    assert len(subject.problems) == flip
+    json.dumps(found.as_json())
 
 
 def test_check_counts_what_the_original_lacks(release):
     (release / path_of(OWN, 3)).unlink()
     found = OcMotionOriginal.check(release)
-    subjects = {subject["subject"]: subject for subject in found["subjects"]}
-    assert subjects["0011_02"]["missing"] == {"image": 1, "mask": 0}
-    assert subjects["0011_01_p1"]["missing"] == {"image": N_FRAMES, "mask": N_FRAMES}
-    assert "no image with its mask found" in subjects["0011_01_p1"]["problems"]
-    assert not found["ok"]
+    subjects = {subject.subject: subject for subject in found.subjects}
+    assert subjects["0011_02"].missing == {"image": 1, "mask": 0}
+    assert subjects["0011_01_p1"].missing == {"image": N_FRAMES, "mask": N_FRAMES}
+    assert "no image with its mask and pose found" in subjects["0011_01_p1"].problems
+    assert not found.ok

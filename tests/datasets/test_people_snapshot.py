@@ -22,8 +22,8 @@ from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.datasets.people_snapshot import gaussianavatar, instantavatar
 from ihbench.datasets.people_snapshot import original as people_snapshot
-from ihbench.datasets.people_snapshot.gaussianavatar import GaussianAvatar
-from ihbench.datasets.people_snapshot.instantavatar import InstantAvatar
+from ihbench.datasets.people_snapshot.gaussianavatar import GaussianAvatarFolder
+from ihbench.datasets.people_snapshot.instantavatar import InstantAvatarFolder
 from ihbench.datasets.people_snapshot.original import PeopleSnapshotRaw
 from ihbench.errors import BadInput
 from ihbench.files import atomic
@@ -115,7 +115,7 @@ def write_gaussianavatar(folder, scene):
 
 
 WRITERS = {"raw": write_raw, "instantavatar": write_instantavatar, "gaussianavatar": write_gaussianavatar}
-READERS = {"raw": PeopleSnapshotRaw, "instantavatar": InstantAvatar, "gaussianavatar": GaussianAvatar}
+READERS = {"raw": PeopleSnapshotRaw, "instantavatar": InstantAvatarFolder, "gaussianavatar": GaussianAvatarFolder}
 
 
 @pytest.fixture(scope="module")
@@ -167,10 +167,10 @@ def message(error) -> str:
 
 
 def problems(report) -> str:
-    (subject,) = report["subjects"]
-    assert report["ok"] == (not subject["problems"])
-    assert all("\n" not in problem for problem in subject["problems"])
-    return " | ".join(subject["problems"])
+    (subject,) = report.subjects
+    assert report.ok == (not subject.problems)
+    assert all("\n" not in problem for problem in subject.problems)
+    return " | ".join(subject.problems)
 
 
 def assert_same_camera(read: Camera, camera: Camera, atol: float):
@@ -242,15 +242,15 @@ def test_reading_gives_back_what_was_written(written, scene, layout):
 def test_check_finds_nothing_wrong(written, smpl, layout):
     report = READERS[layout].check(written[layout], smpl)
     assert problems(report) == ""
-    (found,) = report["subjects"]
-    assert (report["dataset"], report["layout"], report["standin"]) == ("people_snapshot", layout, "")
-    assert report["root"] == str(written[layout])
-    assert (found["cameras"], found["frames"], found["image_size"]) == (1, N, [[WIDTH, HEIGHT]])
-    assert found["sampled_images"] == 3
-    assert found["vertices_in_mask"] > 0.99
-    assert not any(found["missing"].values())
+    (found,) = report.subjects
+    assert (report.dataset, report.layout, report.standin) == ("people_snapshot", layout, "")
+    assert report.root == str(written[layout])
+    assert (found.cameras, found.frames, found.image_size) == (1, N, [[WIDTH, HEIGHT]])
+    assert found.sampled_images == 3
+    assert found.vertices_in_mask > 0.99
+    assert not any(found.missing.values())
     # the interface's own call, without a body
-    assert "vertices_in_mask" not in READERS[layout].check(written[layout])["subjects"][0]
+    assert READERS[layout].check(written[layout]).subjects[0].vertices_in_mask is None
 
 
 @pytest.mark.parametrize("layout", READERS)
@@ -324,8 +324,8 @@ def test_standins_take_the_own_body(copy_of, layout):
     assert (capture.body, capture.standin) == ("procedural", "stand-in v1 seed 0")
     report = READERS[layout].check(folder.parent)
     assert problems(report) == ""
-    assert report["standin"] == "stand-in v1 seed 0"
-    assert report["subjects"][0]["vertices_in_mask"] > 0.99
+    assert report.standin == "stand-in v1 seed 0"
+    assert report.subjects[0].vertices_in_mask > 0.99
 
 
 @pytest.mark.parametrize("layout", READERS)
@@ -387,7 +387,7 @@ def test_captures_can_be_pickled(written, scene):
 )
 def test_gender_is_in_the_name(written, tmp_path, name, gender):
     shutil.copytree(written["instantavatar"] / SUBJECT, tmp_path / name)
-    assert InstantAvatar(tmp_path).open(name).gender == gender
+    assert InstantAvatarFolder(tmp_path).open(name).gender == gender
 
 
 def test_betas_must_be_the_same_in_all_frames(tmp_path, scene):
@@ -527,14 +527,14 @@ def test_video_shorter_than_the_masks(tmp_path, scene):
     write_raw(tmp_path / SUBJECT, scene, n_video=5)
     assert PeopleSnapshotRaw(tmp_path).open(SUBJECT).n_frames == 5
     report = PeopleSnapshotRaw.check(tmp_path)
-    assert "5 frames of video, 8 masks" in report["subjects"][0]["warnings"][0]
-    assert report["subjects"][0]["missing"] == {"video": 3, "poses": 0}
+    assert "5 frames of video, 8 masks" in report.subjects[0].warnings[0]
+    assert report.subjects[0].missing == {"video": 3, "poses": 0}
 
 
 def test_fewer_poses_than_masks(raw, scene):
     people_snapshot.write_poses(raw, scene.poses[:6])
     assert PeopleSnapshotRaw(raw).open(SUBJECT).n_frames == 6
-    assert "8 masks, 6 poses" in PeopleSnapshotRaw.check(raw)["subjects"][0]["warnings"][0]
+    assert "8 masks, 6 poses" in PeopleSnapshotRaw.check(raw).subjects[0].warnings[0]
 
 
 def test_video_of_another_size(raw, scene):
@@ -598,8 +598,8 @@ def test_consensus_and_keypoints_come_back(raw, scene):
         assert file["keypoints"].shape == (N, 54)
     report = PeopleSnapshotRaw.check(raw)
     assert problems(report) == ""
-    assert report["subjects"][0]["consensus_betas"] == 0.25
-    assert report["subjects"][0]["files"]["keypoints"] == N
+    assert report.subjects[0].consensus_betas == 0.25
+    assert report.subjects[0].files["keypoints"] == N
     (raw / "consensus.pkl").write_bytes(b"nothing")
     rewrite_hdf5(raw / "keypoints.hdf5", keypoints=np.zeros((N, 51)))
     found = problems(PeopleSnapshotRaw.check(raw))
@@ -753,7 +753,7 @@ def test_silhouettes_decide_which_poses_are_theirs(raw, scene, smpl, true):
         assert_same_pose(capture.body_pose(frame), scene.poses[frame])
     report = PeopleSnapshotRaw.check(raw, smpl)
     assert problems(report) == ""
-    found = report["subjects"][0]["alignment"]
+    found = report.subjects[0].alignment
     assert found["chosen"] == true
     assert found[true] > 0.95 > 0.9 > found["first" if true == "last" else "last"]
 
@@ -763,8 +763,8 @@ def test_without_a_body_the_first_poses_are_taken(raw, scene):
     capture = PeopleSnapshotRaw(raw).open(SUBJECT)
     assert (capture.alignment, capture.variant) == ("first", "raw/first")
     assert_same_pose(capture.body_pose(3), scene.poses[3])
-    found = PeopleSnapshotRaw.check(raw)["subjects"][0]
-    assert found["alignment"] == {"chosen": "first", "first": None, "last": None}
+    found = PeopleSnapshotRaw.check(raw).subjects[0]
+    assert found.alignment == {"chosen": "first", "first": None, "last": None}
 
 
 def test_surplus_poses_that_are_nan(raw, scene, smpl):
@@ -825,14 +825,14 @@ def test_masks_of_several_kinds(instant, scene, kind):
         "channel": mask[..., None].astype(np.uint8),
     }[kind]
     np.save(instant / "masks/mask_0001.npy", stored)
-    np.testing.assert_array_equal(InstantAvatar(instant).open(SUBJECT).silhouette(0, 1), mask)
+    np.testing.assert_array_equal(InstantAvatarFolder(instant).open(SUBJECT).silhouette(0, 1), mask)
 
 
 @pytest.mark.parametrize(
     ("stored", "expected"),
     [
         (np.zeros((HEIGHT, WIDTH, 3)), r"shape \[H, W\], found float64 of shape \[64, 48, 3\]"),
-        (np.zeros((HEIGHT, WIDTH - 1)), "47×64 px, but the camera is 48×64 px"),
+        (np.zeros((HEIGHT, WIDTH - 1)), "47×64 px, but the camera's images are 48×64 px"),
         (np.full((HEIGHT, WIDTH), np.nan), "0 to 255, found nan"),
         (np.full((HEIGHT, WIDTH), 1000), "0 to 255, found 1000"),
         (np.zeros((HEIGHT, WIDTH), "U3"), r"expected numbers"),
@@ -841,7 +841,7 @@ def test_masks_of_several_kinds(instant, scene, kind):
 def test_bad_mask_arrays(instant, stored, expected):
     np.save(instant / "masks/mask_0001.npy", stored)
     with pytest.raises(BadInput, match=expected) as error:
-        InstantAvatar(instant).open(SUBJECT).silhouette(0, 1)
+        InstantAvatarFolder(instant).open(SUBJECT).silhouette(0, 1)
     assert "mask_0001.npy" in message(error)
 
 
@@ -849,10 +849,10 @@ def test_hostile_arrays_do_not_run(instant, tmp_path):
     marker = tmp_path / "it_ran"
     np.save(instant / "masks/mask_0001.npy", np.array([Attack(marker)]), allow_pickle=True)
     with pytest.raises(BadInput, match="refused"):
-        InstantAvatar(instant).open(SUBJECT).silhouette(0, 1)
+        InstantAvatarFolder(instant).open(SUBJECT).silhouette(0, 1)
     np.savez(instant / "poses.npz", betas=np.array([Attack(marker)]), thetas=np.zeros((N, 72)), transl=BETAS)
     with pytest.raises(BadInput, match=r"poses.npz: betas: expected numbers or text, found object") as error:
-        InstantAvatar(instant).open(SUBJECT)
+        InstantAvatarFolder(instant).open(SUBJECT)
     message(error)
     assert not marker.exists()
 
@@ -861,15 +861,15 @@ def test_refined_poses_replace_those_of_their_frames(instant, scene):
     refined = [dataclasses.replace(p, transl=p.transl + 0.5, betas=BETAS + 1) for p in scene.poses]
     instantavatar.write_refined(instant, "train", [1, 3], [refined[1], refined[3]])
     instantavatar.write_refined(instant, "test", [6], [refined[6]])
-    capture = InstantAvatar(instant).open(SUBJECT)
+    capture = InstantAvatarFolder(instant).open(SUBJECT)
     assert capture.variant == "instantavatar/anim_nerf"
     for frame in range(N):
         assert_same_pose(capture.body_pose(frame), (refined if frame in (1, 3, 6) else scene.poses)[frame])
-    files = InstantAvatar.check(instant)["subjects"][0]["files"]
+    files = InstantAvatarFolder.check(instant).subjects[0].files
     assert (files["anim_nerf_train"], files["anim_nerf_test"]) == (2, 1)
     instantavatar.write_refined(instant, "test", [3], [refined[3]])
     with pytest.raises(BadInput, match=r"frame 3 has refined poses in poses/anim_nerf_train.npz, too") as error:
-        InstantAvatar(instant).open(SUBJECT)
+        InstantAvatarFolder(instant).open(SUBJECT)
     message(error)
 
 
@@ -894,7 +894,7 @@ def test_refined_poses_of_the_official_splits(tmp_path, scene, subject, split, f
     instantavatar.write_refined(folder, split, list(frames), refined)
     path = folder / f"poses/anim_nerf_{split}.npz"
     rewrite_npz(path, frames=None)
-    capture = InstantAvatar(tmp_path).open(subject)
+    capture = InstantAvatarFolder(tmp_path).open(subject)
     assert capture.n_frames == 873
     for frame in range(873):
         assert capture.body_pose(frame).transl[0] == (frame if frame in frames else -1)
@@ -902,10 +902,10 @@ def test_refined_poses_of_the_official_splits(tmp_path, scene, subject, split, f
         thetas, transl = file["thetas"], file["transl"]
     # global_orient and body_pose in place of thetas, as InstantAvatar accepts
     rewrite_npz(path, thetas=None, global_orient=thetas[:, :3], body_pose=thetas[:, 3:])
-    assert_same_pose(InstantAvatar(tmp_path).open(subject).body_pose(frames[1]), refined[1])
+    assert_same_pose(InstantAvatarFolder(tmp_path).open(subject).body_pose(frames[1]), refined[1])
     rewrite_npz(path, thetas=thetas[1:], transl=transl[1:])
     with pytest.raises(BadInput, match=rf"{len(frames) - 1} poses, but no 'frames' .* has {len(frames)}") as error:
-        InstantAvatar(tmp_path).open(subject)
+        InstantAvatarFolder(tmp_path).open(subject)
     message(error)
 
 
@@ -924,10 +924,10 @@ def test_refined_poses_of_other_frames(instant, scene, frames, expected):
     instantavatar.write_refined(instant, "train", [0, 1], scene.poses[:2])
     rewrite_npz(instant / "poses/anim_nerf_train.npz", frames=None if frames is None else np.array(frames))
     with pytest.raises(BadInput, match=expected):
-        InstantAvatar(instant).open(SUBJECT)
+        InstantAvatarFolder(instant).open(SUBJECT)
     instant.rename(instant.with_name("someone"))
     with pytest.raises(BadInput, match=expected if frames else "no official split"):
-        InstantAvatar(instant.parent).open("someone")
+        InstantAvatarFolder(instant.parent).open("someone")
 
 
 @pytest.mark.parametrize(
@@ -951,7 +951,7 @@ def test_refined_poses_of_other_frames(instant, scene, frames, expected):
 def test_npz_of_another_shape(instant, name, changes, expected):
     rewrite_npz(instant / name, **changes)
     with pytest.raises(BadInput, match=expected) as error:
-        InstantAvatar(instant).open(SUBJECT)
+        InstantAvatarFolder(instant).open(SUBJECT)
     assert name in message(error)
 
 
@@ -967,7 +967,7 @@ def test_npz_cut_short(instant, name, keep):
     elif keep != "missing":
         path.write_bytes(data[: keep if isinstance(keep, int) else int(keep * len(data))])
     with pytest.raises(BadInput, match=rf"{name}: ") as error:
-        InstantAvatar(instant).open(SUBJECT)
+        InstantAvatarFolder(instant).open(SUBJECT)
     message(error)
 
 
@@ -975,21 +975,21 @@ def test_images_that_are_missing(instant, scene):
     (instant / "images/image_0003.png").unlink()
     (instant / "images/image_0007.png").unlink()
     (instant / "masks/mask_0002.npy").unlink()
-    capture = InstantAvatar(instant).open(SUBJECT)
+    capture = InstantAvatarFolder(instant).open(SUBJECT)
     assert capture.n_frames == 7  # of the eight poses the last has no image
     with pytest.raises(BadInput, match=r"image_0003.png: no such file"):
         capture.image(0, 3)
     with pytest.raises(BadInput, match=r"mask_0002.npy: no such file"):
         capture.silhouette(0, 2)
-    assert problems(InstantAvatar.check(instant)) == "1 of image missing | 1 of mask missing"
+    assert problems(InstantAvatarFolder.check(instant)) == "1 of image missing | 1 of mask missing"
     mark_standin(instant.parent)  # which is no problem of a stand-in, and does not shorten it
-    assert InstantAvatar(instant).open(SUBJECT).n_frames == N
-    assert problems(InstantAvatar.check(instant)) == ""
+    assert InstantAvatarFolder(instant).open(SUBJECT).n_frames == N
+    assert problems(InstantAvatarFolder.check(instant)) == ""
     instantavatar.write_frame(instant, 9, scene.images[0], scene.masks[0])
-    assert "1 images have no pose" in InstantAvatar.check(instant)["subjects"][0]["warnings"][0]
+    assert "1 images have no pose" in InstantAvatarFolder.check(instant).subjects[0].warnings[0]
     shutil.rmtree(instant / "images")
     with pytest.raises(BadInput, match=r"no image_NNNN.png"):
-        InstantAvatar(instant).open(SUBJECT)
+        InstantAvatarFolder(instant).open(SUBJECT)
 
 
 def test_nan_in_one_row(instant):
@@ -998,8 +998,8 @@ def test_nan_in_one_row(instant):
     thetas[2, 5] = np.nan
     rewrite_npz(instant / "poses.npz", thetas=thetas)
     with pytest.raises(BadInput, match="NaN or infinity in the pose of row 2"):
-        InstantAvatar(instant).open(SUBJECT).body_pose(2)
-    assert "NaN or infinity in 1 row (2)" in problems(InstantAvatar.check(instant))
+        InstantAvatarFolder(instant).open(SUBJECT).body_pose(2)
+    assert "NaN or infinity in 1 row (2)" in problems(InstantAvatarFolder.check(instant))
 
 
 @pytest.mark.parametrize("layout", ["instantavatar", "gaussianavatar"])
@@ -1012,7 +1012,7 @@ def test_pictures_damaged_or_of_another_size(copy_of, layout):
         READERS[layout](folder).open(SUBJECT).image(0, 2)
     message(error)
     Image.fromarray(np.zeros((HEIGHT, WIDTH + 1, 3), np.uint8)).save(path)
-    with pytest.raises(BadInput, match="49×64 px, but the camera is 48×64 px"):
+    with pytest.raises(BadInput, match="49×64 px, but the camera's images are 48×64 px"):
         READERS[layout](folder).open(SUBJECT).image(0, 2)
 
 
@@ -1029,7 +1029,7 @@ def test_undistorted_layouts_refuse_distortion(tmp_path, scene):
 
 
 def test_frames_are_the_numbers_of_the_images(written):
-    capture = GaussianAvatar(written["gaussianavatar"]).open(SUBJECT)
+    capture = GaussianAvatarFolder(written["gaussianavatar"]).open(SUBJECT)
     assert capture.frames == [0, 2, 4, 5, 7]
     assert [capture.split_of(frame) for frame in capture.frames] == ["train"] * 3 + ["test"] * 2
     for read in (lambda: capture.image(0, 3), lambda: capture.silhouette(0, 3), lambda: capture.body_pose(3)):
@@ -1045,7 +1045,7 @@ def test_other_names_are_counted(gaussian, scene, kind):
     renamed = {"words": ("000000", "a_000000"), "collision": ("000002", "000005")}[kind]
     for folder, end in (("images", "png"), ("masks", "png")):
         (gaussian / f"train/{folder}/{renamed[0]}.{end}").rename(gaussian / f"train/{folder}/{renamed[1]}.{end}")
-    capture = GaussianAvatar(gaussian).open(SUBJECT)
+    capture = GaussianAvatarFolder(gaussian).open(SUBJECT)
     assert (capture.n_frames, capture.frames, capture.numbered) == (5, [0, 1, 2, 3, 4], False)
     # the names in order are 000002, 000004, a_000000 or 000000, 000004, 000005
     shown = [2, 4, 0, 5, 7] if kind == "words" else [0, 4, 2, 5, 7]
@@ -1062,7 +1062,7 @@ def test_jpeg_images_and_grey_masks(gaussian, scene):
     mask = np.full((HEIGHT, WIDTH), 127, np.uint8)
     mask[10:20] = 128
     Image.fromarray(mask).save(gaussian / "train/masks/000002.png")
-    capture = GaussianAvatar(gaussian).open(SUBJECT)
+    capture = GaussianAvatarFolder(gaussian).open(SUBJECT)
     assert psnr(capture.image(0, 2), scene.images[2]) > 30
     np.testing.assert_array_equal(capture.silhouette(0, 2), mask == 128)
     Image.fromarray(mask == 128).save(gaussian / "train/masks/000002.png")  # one bit a pixel
@@ -1082,26 +1082,26 @@ def own_cameras(folder, split, frames, moved=0.0):
 def test_a_camera_file_for_each_image(gaussian, scene):
     for split, frames in SPLIT.items():
         own_cameras(gaussian, split, frames)
-    assert_same_camera(GaussianAvatar(gaussian).open(SUBJECT).camera(0), scene.plain, 1e-12)
+    assert_same_camera(GaussianAvatarFolder(gaussian).open(SUBJECT).camera(0), scene.plain, 1e-12)
     (gaussian / "test/cam_parms/000007.npz").unlink()
     with pytest.raises(BadInput, match=r"cam_parms/000007.npz: no such file"):
-        GaussianAvatar(gaussian).open(SUBJECT).camera(0)
+        GaussianAvatarFolder(gaussian).open(SUBJECT).camera(0)
 
 
 def test_a_moving_camera_is_refused(gaussian):
     own_cameras(gaussian, "test", SPLIT["test"], moved=0.01)
     with pytest.raises(BadInput, match=r"another camera than .*; expected one fixed camera") as error:
-        GaussianAvatar(gaussian).open(SUBJECT).camera(0)
+        GaussianAvatarFolder(gaussian).open(SUBJECT).camera(0)
     message(error)
-    assert "one fixed camera" in problems(GaussianAvatar.check(gaussian))
+    assert "one fixed camera" in problems(GaussianAvatarFolder.check(gaussian))
 
 
 def test_opening_lists_names_only(gaussian):
     for path in gaussian.rglob("*.*"):
         if path.is_file():
             path.write_bytes(b"")
-    assert GaussianAvatar(gaussian).open(SUBJECT).n_frames == N
-    assert "train/smpl_parms.pth" in problems(GaussianAvatar.check(gaussian))
+    assert GaussianAvatarFolder(gaussian).open(SUBJECT).n_frames == N
+    assert "train/smpl_parms.pth" in problems(GaussianAvatarFolder.check(gaussian))
 
 
 def change_parameters(folder, **changes):
@@ -1126,12 +1126,12 @@ def change_parameters(folder, **changes):
 )
 def test_parameter_files_of_another_shape(gaussian, changes, expected):
     change_parameters(gaussian, **changes)
-    capture = GaussianAvatar(gaussian).open(SUBJECT)
+    capture = GaussianAvatarFolder(gaussian).open(SUBJECT)
     with pytest.raises(BadInput, match=expected) as error:
         capture.body_pose(0)
     assert "train/smpl_parms.pth" in message(error)
     assert capture.body_pose(5).transl.any()  # the other split is whole
-    assert "smpl_parms.pth" in problems(GaussianAvatar.check(gaussian))
+    assert "smpl_parms.pth" in problems(GaussianAvatarFolder.check(gaussian))
 
 
 @pytest.mark.parametrize("keep", [0, 10, 0.5, "missing"])
@@ -1142,7 +1142,7 @@ def test_parameter_file_cut_short(gaussian, keep):
     if keep != "missing":
         path.write_bytes(data[: keep if isinstance(keep, int) else int(keep * len(data))])
     with pytest.raises(BadInput, match=r"smpl_parms.pth: ") as error:
-        GaussianAvatar(gaussian).open(SUBJECT).body_pose(0)
+        GaussianAvatarFolder(gaussian).open(SUBJECT).body_pose(0)
     message(error)
 
 
@@ -1150,7 +1150,7 @@ def test_hostile_parameter_file_does_not_run(gaussian, tmp_path):
     marker = tmp_path / "it_ran"
     torch.save({"beta": Attack(marker)}, gaussian / "train/smpl_parms.pth")
     with pytest.raises(BadInput, match="not a file of plain tensors") as error:
-        GaussianAvatar(gaussian).open(SUBJECT).body_pose(0)
+        GaussianAvatarFolder(gaussian).open(SUBJECT).body_pose(0)
     message(error)
     assert not marker.exists()
 
@@ -1158,28 +1158,28 @@ def test_hostile_parameter_file_does_not_run(gaussian, tmp_path):
 def test_masks_or_a_split_missing(gaussian):
     (gaussian / "train/masks/000002.png").unlink()
     with pytest.raises(BadInput, match=r"masks/000002.png: no such file"):
-        GaussianAvatar(gaussian).open(SUBJECT).silhouette(0, 2)
+        GaussianAvatarFolder(gaussian).open(SUBJECT).silhouette(0, 2)
     shutil.rmtree(gaussian / "test")
-    assert problems(GaussianAvatar.check(gaussian)) == "1 of mask missing | no image in test/images"
+    assert problems(GaussianAvatarFolder.check(gaussian)) == "1 of mask missing | no image in test/images"
     for path in (gaussian / "train/images").iterdir():
         path.unlink()
     with pytest.raises(BadInput, match="no image in train/images or test/images"):
-        GaussianAvatar(gaussian).open(SUBJECT)
+        GaussianAvatarFolder(gaussian).open(SUBJECT)
 
 
 def test_copy_made_beside_its_source_is_gaussianavatars(gaussian, written):
     """GaussianAvatar's script leaves cameras.npz, images/ and masks/ where it makes train/ and test/."""
     shutil.copytree(written["instantavatar"] / SUBJECT, gaussian, dirs_exist_ok=True)
-    assert GaussianAvatar(gaussian).subjects() == [SUBJECT]
+    assert GaussianAvatarFolder(gaussian).subjects() == [SUBJECT]
     with pytest.raises(BadInput, match="no subject of this layout"):
-        InstantAvatar(gaussian)
+        InstantAvatarFolder(gaussian)
 
 
 def test_folder_that_holds_several_layouts_is_the_released_one(raw, written):
     for layout in ("instantavatar", "gaussianavatar"):
         shutil.copytree(written[layout] / SUBJECT, raw, dirs_exist_ok=True)
         assert PeopleSnapshotRaw(raw).subjects() == [SUBJECT]
-        for other in (InstantAvatar, GaussianAvatar):
+        for other in (InstantAvatarFolder, GaussianAvatarFolder):
             with pytest.raises(BadInput, match="no subject of this layout"):
                 other(raw)
 
@@ -1191,10 +1191,10 @@ def test_an_upper_case_ending_of_the_video_is_read(raw):
 
 def test_a_file_of_another_spelling_is_named(instant, gaussian):
     (instant / "images/image_0001.png").rename(instant / "images/image_0001.PNG")
-    capture = GaussianAvatar(gaussian).open(SUBJECT)
+    capture = GaussianAvatarFolder(gaussian).open(SUBJECT)
     path = capture.mask_path(capture.frames[0])
     path.rename(path.with_suffix(".PNG"))
     with pytest.raises(BadInput, match=r"there is 'image_0001.PNG', rename it to 'image_0001.png'"):
-        InstantAvatar(instant).open(SUBJECT).image(0, 1)
+        InstantAvatarFolder(instant).open(SUBJECT).image(0, 1)
     with pytest.raises(BadInput, match=rf"there is '{path.stem}.PNG', rename it to '{path.name}'"):
         capture.silhouette(0, capture.frames[0])

@@ -103,9 +103,9 @@ def message(error) -> str:
 
 
 def problems_of(folder) -> list[str]:
-    (subject,) = plain_scene.check(folder)["subjects"]
-    assert all("\n" not in problem for problem in subject["problems"])
-    return subject["problems"]
+    (subject,) = PlainScene.check(folder).subjects
+    assert all("\n" not in problem for problem in subject.problems)
+    return subject.problems
 
 
 def change_json(path, change):
@@ -327,7 +327,7 @@ def test_a_scene_folder_may_be_the_current_folder(written, monkeypatch):
 def test_other_folders_are_bad_input(tmp_path, written):
     with pytest.raises(BadInput, match="no such folder"):
         PlainScene(tmp_path / "nowhere")
-    with pytest.raises(BadInput, match=r"neither cameras\.json") as error:
+    with pytest.raises(BadInput, match=r"expected a scene \(cameras\.json") as error:
         PlainScene(tmp_path)
     message(error)
     shutil.copytree(written[0], tmp_path / "deep/deeper/dance")
@@ -540,17 +540,17 @@ def test_digests_follow_the_bytes(copy):
 
 def test_check_of_a_good_scene(written):
     found = PlainScene.check(written[0])
-    (subject,) = found["subjects"]
-    assert found["ok"], subject["problems"]
-    assert (found["dataset"], found["layout"], found["standin"]) == ("custom", "plain", "")
-    assert subject["vertices_in_mask"] > 0.98
-    assert subject["mask_on_body"] > 0.98
-    assert subject["body_used"] == "own"
+    (subject,) = found.subjects
+    assert found.ok, subject.problems
+    assert (found.dataset, found.layout, found.standin) == ("custom", "plain", "")
+    assert subject.vertices_in_mask > 0.98
+    assert subject.mask_on_body > 0.98
+    assert subject.body_used == "own"
     expected = {"subject": "dance", "variant": "plain", "body": "own", "cameras": 2, "frames": 3}
     expected |= {"files": {"image": 6, "mask": 6}, "missing": {"image": 0, "mask": 0, "pose": 0}}
     expected |= {"sampled_images": 6, "image_size": [[WIDTH, HEIGHT]]}
-    assert {key: subject[key] for key in expected} == expected
-    json.dumps(atomic.encode(found))
+    assert {key: getattr(subject, key) for key in expected} == expected
+    json.dumps(atomic.encode(found.as_json()))
 
 
 def smpl_like():
@@ -566,28 +566,28 @@ def test_check_without_the_smpl_model(root, tmp_path):
         BodyPose(pose.pose, 0.5 * pose.betas, pose.transl + np.array([0, 0.235, -0.03])) for pose in make_poses(body)
     ]
     write_scene(tmp_path / "s", body, poses=poses, own=False, root=root)
-    (subject,) = plain_scene.check(tmp_path / "s")["subjects"]
-    assert subject["problems"] == []
-    assert subject["body_used"].startswith("procedural")
-    assert subject["vertices_in_mask"] > 0.85
-    (subject,) = plain_scene.check(tmp_path / "s", body=body)["subjects"]
-    assert subject["body_used"] == "smpl"
-    assert subject["vertices_in_mask"] > 0.98
+    (subject,) = PlainScene.check(tmp_path / "s").subjects
+    assert subject.problems == []
+    assert subject.body_used.startswith("procedural")
+    assert subject.vertices_in_mask > 0.85
+    (subject,) = PlainScene.check(tmp_path / "s", body=body).subjects
+    assert subject.body_used == "smpl"
+    assert subject.vertices_in_mask > 0.98
 
 
 def test_check_names_missing_files(copy):
     (copy / "masks/left/000004.png").unlink()
     (copy / "images/right/000010.png").unlink()
     plain_scene.write_frame(copy, 77, np.zeros((HEIGHT, WIDTH, 3), np.uint8), camera_id="left")
-    (subject,) = plain_scene.check(copy)["subjects"]
+    (subject,) = PlainScene.check(copy).subjects
     what_to_do = "copy the files, or leave these frames out of poses.npz"
-    assert subject["problems"] == [
+    assert subject.problems == [
         f"1 images of camera 'left' have no mask; the first is frame 4: {what_to_do}",
         f"1 poses have no image of camera 'right'; the first is frame 10: {what_to_do}",
     ]
     pose_less = "1 images of camera 'left' have no pose in poses.npz and are not used; the first is frame 77"
-    assert subject["warnings"] == [pose_less]
-    assert subject["missing"] == {"image": 1, "mask": 1, "pose": 1}
+    assert subject.warnings == [pose_less]
+    assert subject.missing == {"image": 1, "mask": 1, "pose": 1}
 
 
 def test_check_names_files_it_does_not_understand(copy):
@@ -657,9 +657,9 @@ QUIRKS = {
 @pytest.mark.parametrize("name", QUIRKS)
 def test_what_other_systems_make_of_names_is_read(name, written, copy):
     QUIRKS[name](copy)
-    found = plain_scene.check(f"{copy}/")
-    (subject,) = found["subjects"]
-    assert (subject["problems"], subject["warnings"]) == ([], [])
+    found = PlainScene.check(f"{copy}/")
+    (subject,) = found.subjects
+    assert (subject.problems, subject.warnings) == ([], [])
     capture, before = PlainScene(copy).open("dance"), PlainScene(written[0]).open("dance")
     camera = 1 if name == "accents" else 0  # it now is the last one
     for frame in range(len(FRAMES)):
@@ -677,18 +677,18 @@ def test_frames_left_out_as_the_page_tells(written, copy):
     assert "NaN or infinity in row 1" in problem
     assert "leave such rows out and write the frame numbers of the others as 'frames'" in problem
     np.savez(copy / "poses.npz", **{k: v[[0, 2]] if k in per_frame else v for k, v in spoiled.items()})
-    found = plain_scene.check(copy)
-    assert found["ok"]
-    assert found["subjects"][0]["warnings"] == [
+    found = PlainScene.check(copy)
+    assert found.ok
+    assert found.subjects[0].warnings == [
         f"1 images of camera {name!r} have no pose in poses.npz and are not used; the first is frame 4"
         for name in NAMES
     ]
     np.savez(copy / "poses.npz", **arrays)
     for path in copy.glob("images/*/000004.png"):
         path.unlink()
-    found = plain_scene.check(copy)
-    assert found["ok"]
-    assert found["subjects"][0]["warnings"] == ["1 poses have no image and are not used; the first is frame 4"]
+    found = PlainScene.check(copy)
+    assert found.ok
+    assert found.subjects[0].warnings == ["1 poses have no image and are not used; the first is frame 4"]
     capture, before = PlainScene(copy).open("dance"), PlainScene(written[0]).open("dance")
     assert [capture.number(frame) for frame in range(capture.n_frames)] == [3, 10]
     np.testing.assert_array_equal(capture.body_pose(1).pose, before.body_pose(2).pose)
@@ -779,9 +779,9 @@ def test_check_names_cameras_that_see_no_body(copy, own_body):
 
 def test_check_of_a_scene_that_cannot_be_opened(copy):
     (copy / "poses.npz").unlink()
-    found = plain_scene.check(copy)
-    assert not found["ok"]
-    assert "poses.npz: no such file" in found["subjects"][0]["problems"][0]
+    found = PlainScene.check(copy)
+    assert not found.ok
+    assert "poses.npz: no such file" in found.subjects[0].problems[0]
 
 
 def test_check_without_pictures(copy):

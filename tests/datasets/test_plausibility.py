@@ -12,6 +12,7 @@ from ihbench.body import load_body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.datasets.plain import plain_scene
+from ihbench.datasets.plain.plain_scene import PlainScene
 from ihbench.datasets.reading.plausibility import absurd_camera, suspicious_camera
 from ihbench.render.zbuffer import rasterize
 
@@ -177,9 +178,9 @@ def test_what_no_sound_scene_has(name, scene, tmp_path):
     damage, words = PROBLEMS[name]
     folder = shutil.copytree(scene, tmp_path / "turn")
     damage(folder)
-    found = plain_scene.check(folder)
-    problems = found["subjects"][0]["problems"]
-    assert not found["ok"]
+    found = PlainScene.check(folder)
+    problems = found.subjects[0].problems
+    assert not found.ok
     assert any(words in line for line in problems), problems
     assert all("\n" not in line and "nan" not in line for line in problems)
 
@@ -209,9 +210,9 @@ def test_what_few_sound_scenes_have(name, scene, tmp_path):
     damage, words = WARNINGS[name]
     folder = shutil.copytree(scene, tmp_path / "turn")
     damage(folder)
-    found = plain_scene.check(folder)
-    assert found["ok"], found["subjects"][0]["problems"]
-    assert any(words in line for line in found["subjects"][0]["warnings"]), found["subjects"][0]["warnings"]
+    found = PlainScene.check(folder)
+    assert found.ok, found.subjects[0].problems
+    assert any(words in line for line in found.subjects[0].warnings), found.subjects[0].warnings
 
 
 SOUND = {
@@ -228,21 +229,21 @@ SOUND = {
 def test_sound_scenes_pass_without_a_word(name, scene, tmp_path):
     folder = shutil.copytree(scene, tmp_path / "turn")
     SOUND[name](folder)
-    found = plain_scene.check(folder)
-    assert (found["ok"], found["subjects"][0]["warnings"]) == (True, []), found["subjects"][0]["problems"]
+    found = PlainScene.check(folder)
+    assert (found.ok, found.subjects[0].warnings) == (True, []), found.subjects[0].problems
 
 
 def test_the_advice_on_moved_masks_is_true(scene, tmp_path):
     """What the line says helps."""
     folder = shutil.copytree(scene, tmp_path / "turn")
     masks(lambda m: np.roll(m, 6, 1))(folder)
-    assert not plain_scene.check(folder)["ok"]
+    assert not PlainScene.check(folder).ok
     set_K(cx=WIDTH / 2 - 0.5 + 6)(folder)
-    assert plain_scene.check(folder)["ok"]
+    assert PlainScene.check(folder).ok
     small_pictures(folder)
-    assert not plain_scene.check(folder)["ok"]
+    assert not PlainScene.check(folder).ok
     camera(lambda entry: entry.update(K=(np.diag([0.5, 0.5, 1]) @ np.array(entry["K"])).tolist()))(folder)
-    assert plain_scene.check(folder)["ok"]
+    assert PlainScene.check(folder).ok
 
 
 @pytest.mark.parametrize(

@@ -245,10 +245,10 @@ def test_part_labels(capture):
 
 def test_data_check_finds_nothing_wrong(root):
     found = ZjuMocap.check(root)
-    assert found["ok"]
-    assert found["standin"] == "stand-in v2 seed 0"
-    assert found["subjects"][0]["vertices_in_mask"] > 0.99
-    assert found["subjects"][0]["files"]["image"] == len(PAIRS)
+    assert found.ok
+    assert found.standin == "stand-in v2 seed 0"
+    assert found.subjects[0].vertices_in_mask > 0.99
+    assert found.subjects[0].files["image"] == len(PAIRS)
 
 
 # -------------------------------------------------------------------------------------------- the cast

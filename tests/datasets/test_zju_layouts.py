@@ -142,19 +142,19 @@ def test_the_dispatcher_finds_each_layout_and_refuses_others(refine, nerf, tmp_p
         ZJU_MOCAP(tmp_path / "empty")
     with pytest.raises(BadInput, match="no such folder"):
         ZJU_MOCAP(tmp_path / "nowhere")
-    assert ZJU_MOCAP.check(refine.parent)["layout"] == "refine"
-    assert ZJU_MOCAP.check(nerf.parent)["layout"] == "humannerf"
+    assert ZJU_MOCAP.check(refine.parent).layout == "refine"
+    assert ZJU_MOCAP.check(nerf.parent).layout == "humannerf"
 
 
 def test_checks_are_clean_and_name_damage(refine, nerf):
     good = ZJU_MOCAP.check(refine.parent)
-    assert good["ok"], good
-    assert good["subjects"][0]["vertices_in_mask"] > 0.95
-    assert ZJU_MOCAP.check(nerf.parent)["ok"]
+    assert good.ok, good
+    assert good.subjects[0].vertices_in_mask > 0.95
+    assert ZJU_MOCAP.check(nerf.parent).ok
     (nerf / "masks" / "camera_02_frame_000001.png").unlink()
     (refine / "smpl_params" / "1.npy").unlink()
-    assert "1 of masks missing" in ZJU_MOCAP.check(nerf.parent)["subjects"][0]["problems"]
-    assert "1 of smpl_params missing" in ZJU_MOCAP.check(refine.parent)["subjects"][0]["problems"]
+    assert "1 of masks missing" in ZJU_MOCAP.check(nerf.parent).subjects[0].problems
+    assert "1 of smpl_params missing" in ZJU_MOCAP.check(refine.parent).subjects[0].problems
 
 
 @pytest.mark.parametrize(
@@ -187,7 +187,7 @@ def test_missing_and_resized_pictures_are_named(nerf, smpl):
     capture = HumanNerfFormat(nerf).open("377", smpl)
     with pytest.raises(BadInput, match="no such file"):
         capture.image(0, 1)
-    with pytest.raises(BadInput, match="9×9 px, expected 64×48"):
+    with pytest.raises(BadInput, match=r"9×9 px, but the camera.s images are 64×48"):
         capture.image(0, 2)
     with pytest.raises(BadInput, match="no frame 7"):
         capture.image(0, 7)

@@ -244,7 +244,7 @@ def test_missing_root(tmp_path):
 
 
 def test_no_subject_folder_says_where_there_is_one(tmp_path):
-    with pytest.raises(BadInput, match=r"no CoreView_\* folder in it; expected the original"):
+    with pytest.raises(BadInput, match=r"no subject of this layout in it; expected CoreView_"):
         ZjuMocap(tmp_path)
     (tmp_path / "my_377").mkdir()
     with pytest.raises(BadInput, match="refine"):
@@ -481,28 +481,28 @@ def test_check_counts_what_is_there_and_what_is_missing(copy):
     shutil.rmtree(copy / "mask_cihp")
     (copy / "new_vertices/2.npy").unlink()
     found = ZjuMocap.check(copy.parent)
-    (subject,) = found["subjects"]
-    assert (found["dataset"], found["layout"], found["standin"], found["ok"]) == ("zju_mocap", "original", "", False)
-    assert (subject["subject"], subject["variant"]) == ("377", "original/new_params")
-    assert (subject["cameras"], subject["frames"]) == (N_CAMERAS, N_FRAMES)
-    assert subject["missing"] == {"image": 1, "mask": 1, "mask_cihp": 6, "new_params": 0, "new_vertices": 1}
-    assert subject["image_size"] == [[WIDTH, HEIGHT]]
-    assert "1 of image missing" in subject["problems"]
-    json.dumps(found)
+    (subject,) = found.subjects
+    assert (found.dataset, found.layout, found.standin, found.ok) == ("zju_mocap", "original", "", False)
+    assert (subject.subject, subject.variant) == ("377", "original/new_params")
+    assert (subject.cameras, subject.frames) == (N_CAMERAS, N_FRAMES)
+    assert subject.missing == {"image": 1, "mask": 1, "mask_cihp": 6, "new_params": 0, "new_vertices": 1}
+    assert subject.image_size == [[WIDTH, HEIGHT]]
+    assert "1 of image missing" in subject.problems
+    json.dumps(found.as_json())
 
 
 def test_check_reports_a_damaged_subject_instead_of_raising(copy):
     (copy / "annots.npy").write_bytes(b"")
-    (subject,) = ZjuMocap.check(copy.parent)["subjects"]
-    assert len(subject["problems"]) == 1
-    assert "annots.npy" in subject["problems"][0]
+    (subject,) = ZjuMocap.check(copy.parent).subjects
+    assert len(subject.problems) == 1
+    assert "annots.npy" in subject.problems[0]
 
 
 def test_check_notices_vertices_outside_the_silhouettes(written):
     """The tiny capture's bodies stand anywhere: nothing ties them to its masks."""
-    (subject,) = ZjuMocap.check(written[0])["subjects"]
-    assert subject["vertices_in_mask"] < 0.95
-    assert any("project into the silhouettes" in problem for problem in subject["problems"])
+    (subject,) = ZjuMocap.check(written[0]).subjects
+    assert subject.vertices_in_mask < 0.95
+    assert any("project into the silhouettes" in problem for problem in subject.problems)
 
 
 def test_interrupted_write_leaves_the_old_file(written, tmp_path, monkeypatch):
