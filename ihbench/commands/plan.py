@@ -37,6 +37,7 @@ def _planned(chosen: SceneChoice, protocol: Protocol) -> dict[str, Any]:
     from ihbench.scene.data_source import locate, open_capture
     from ihbench.scene.method_spec import method_spec
     from ihbench.scene.plan import absent_regions, measure_scene
+    from ihbench.scene.views import open_scene
 
     config = configuration(chosen.method, chosen.profile, {})
     source = locate(protocol, chosen.data, chosen.scene)
@@ -58,11 +59,11 @@ def _planned(chosen: SceneChoice, protocol: Protocol) -> dict[str, Any]:
         if not source.exists(scene):
             report["scenes"][scene] = {"note": "stand-in not made yet: the run makes it; measured then"}
             continue
-        capture, body = open_capture(protocol.dataset, source.root, scene, chosen.body)
+        capture, _ = open_capture(protocol.dataset, source.root, scene, chosen.body)
         where = f"{capture.dataset} {capture.name}"
         protocol.check_views(capture.name, capture.n_frames, len(capture.camera_ids), where)
         try:
-            measure = measure_scene(capture, protocol, body)
+            measure = measure_scene(open_scene(capture, protocol))
         except BadInput as error:
             if not source.is_standin:
                 raise

@@ -36,7 +36,7 @@ def score_rows(repeats: int, views: int = VIEWS, profile: str = PROFILE) -> list
 
     protocol = load_protocol(PROTOCOL, profile)
     source = locate(protocol, None, (protocol.subjects.standin[0],))
-    capture, body = source.open(source.scenes[0], None, Progress())
+    capture, _ = source.open(source.scenes[0], None, Progress())
     scene = open_scene(capture, protocol)
     background = protocol.image.background
     indices = range(min(views, len(scene.test_keys)))
@@ -44,7 +44,7 @@ def score_rows(repeats: int, views: int = VIEWS, profile: str = PROFILE) -> list
     with TemporaryDirectory() as name:
         folder = Path(name)
         scene.train.preload().wait()
-        built = Scorer.build(scene, body)
+        built = Scorer.build(scene)
         for index in indices:
             off = np.roll(scene.test[index].image, 1, axis=1)
             write_png(folder / "in" / f"{index}.png", rounded(off))

@@ -39,11 +39,11 @@ def rescore(folder: Path, preset: str, data: Path | None, body: Path | None, pro
     code = bench_code(reopen_protocol(folder), (chosen.name,))
     if file.is_file() and _stands(file, chosen, code):
         return
-    scene, model = reopen_scene(folder, data, body)
-    scorer = Scorer.build(scene, model, [chosen.name])
+    scene, _ = reopen_scene(folder, data, body)
+    scorer = Scorer.build(scene, [chosen.name])
     name = run.identity["method"]
     rows = {name: lambda loaded: _render(run, loaded)}
-    rows |= ScoreStage(scorer, model, run, folder.parent, progress).calibration_rows()
+    rows |= ScoreStage(scorer, run, folder.parent, progress).calibration_rows()
     results: dict[str, list[ViewScores]] = {row: [] for row in rows}
     with run.lock(), progress.task(f"scoring {scene.capture.name} as {preset}", len(scene.test_keys)) as task:
         for scored in scorer.scored(rows, range(len(scene.test_keys)), threaded=True):

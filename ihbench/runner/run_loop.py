@@ -33,7 +33,7 @@ from ihbench.record.store import RunFolder, RunIdentity, is_finished
 from ihbench.runner.recorded_run import RecordedRun, about_scene, recorded
 from ihbench.runner.score_stage import ScoreStage
 from ihbench.scene.capture_digest import capture_digest
-from ihbench.scene.contracts import Avatar, Capture, TestView, TrainingSet
+from ihbench.scene.contracts import Avatar, Capture, TestView
 from ihbench.scene.data_source import DataSource
 from ihbench.scene.method_spec import method_spec
 from ihbench.scene.plan import Omission, SceneMeasure, absent_regions, measure_scene
@@ -164,10 +164,10 @@ class _Run(RecordedRun):
         with self.ledger.stage("import"):
             from ihbench.render.splat import warm_up  # brings torch, which `ihbench plan` must not load
 
-        request, protocol, scene = self.request, self.request.protocol, self.occluded
+        request, scene = self.request, self.occluded
         with scene.train.preload() as preloading:  # beside planning and compiling
             with self.ledger.stage("plan"):
-                measure = measure_scene(self.capture, protocol, self.body)
+                measure = measure_scene(scene)
                 config, left_out, withheld = _planned(request, measure)
                 hidden_share = scene.hiding.hidden_share()
             with self.ledger.stage("compile"):
@@ -177,7 +177,7 @@ class _Run(RecordedRun):
             with self.ledger.stage("load"):
                 preloading.wait()
         with self.ledger.stage("visibility"):
-            self.scorer = Scorer.build(scene, self.body)
+            self.scorer = Scorer.build(scene)
         self.describe(
             changed=_changed(request, withheld),
             left_out=[asdict(o) for o in left_out],
@@ -188,16 +188,15 @@ class _Run(RecordedRun):
             with self.ledger.stage("share"):
                 self._take_shared_states()
         self.folder.set_status("running", ledger=self.ledger)
-        training = TrainingSet(scene.train, self.body, protocol.image.background, self.capture.name)
         with self.ledger.stage("fit"):
             avatar = method.fit(
-                training, device=request.device, seed=request.seed, ledger=self.ledger, progress=self.progress
+                scene.training, device=request.device, seed=request.seed, ledger=self.ledger, progress=self.progress
             )
         with self.ledger.stage("save"), self.folder.saving_avatar():
             avatar.save(self.folder.path / "avatar")
         self.folder.set_status("running", ledger=self.ledger)
         with self.ledger.stage("score"):
-            stage = ScoreStage(self.scorer, self.body, self.folder, request.runs, self.progress, request.force)
+            stage = ScoreStage(self.scorer, self.folder, request.runs, self.progress, request.force)
             stage.run(request.method, lambda loaded: self._render(avatar, loaded.view))
         self.describe()
         self.folder.set_status("done", ledger=self.ledger)

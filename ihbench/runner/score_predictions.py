@@ -118,9 +118,9 @@ class _ScoreRun(RecordedRun):
         with self.ledger.stage("load"):
             self.scene.train.preload().wait()
         with self.ledger.stage("visibility"):
-            scorer = Scorer.build(self.scene, self.body)
+            scorer = Scorer.build(self.scene)
         with self.ledger.stage("score"):
-            stage = ScoreStage(scorer, self.body, self.folder, self.request.runs, self.progress, self.request.force)
+            stage = ScoreStage(scorer, self.folder, self.request.runs, self.progress, self.request.force)
             background = self.scene.protocol.image.background
             doubts = Doubts(background)
             stage.run(

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +25,6 @@ from ihbench.scoring.calibration import ROWS, Calibration
 from ihbench.scoring.contact_sheet import SheetRow, contact_sheet
 from ihbench.scoring.scoring import LoadedView, Predictor, Scorer
 
-if TYPE_CHECKING:
-    from ihbench.body import Body
-
 SHEET_VIEWS = 5  # test views on the contact sheet
 SHEET_SIZE = 512  # px; smaller images are enlarged on it by a whole factor
 
@@ -37,7 +34,6 @@ class ScoreStage:
     """Scores one row, a method's or somebody's predictions, over all test views of a scene."""
 
     scorer: Scorer
-    body: Body
     folder: RunFolder
     runs: Path  # where calibration rows are kept for all runs on the same data
     progress: Progress
@@ -90,8 +86,7 @@ class ScoreStage:
 
     def calibration_rows(self) -> dict[str, Predictor]:
         """The predictors of the calibration rows."""
-        background = self.scorer.scene.protocol.image.background
-        calibration = Calibration.build(self.scorer.scene.train, self.body, self.scorer.texels, background)
+        calibration = Calibration.build(self.scorer.scene.training)
         return {row: (lambda loaded, row=row: calibration.predict(row, loaded.view)) for row in ROWS}
 
     def _kept_calibration(self) -> list[dict[str, Any]] | None:

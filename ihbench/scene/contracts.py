@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import IntEnum
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -13,20 +13,14 @@ from numpy.typing import NDArray
 
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
+from ihbench.scene.mask_state import MaskState as MaskState
 
 if TYPE_CHECKING:
     from ihbench.body import Body
     from ihbench.clock.ledger import Ledger
     from ihbench.clock.progress import Progress
     from ihbench.scene.copy_report import CopyReport
-
-
-class MaskState(IntEnum):
-    """What a training pixel is known to show. The complete silhouette is not among it: that would leak the answer."""
-
-    BACKGROUND = 0  # known to show no person
-    PERSON = 1  # visible person
-    UNKNOWN = 2  # behind the occluder: person or background, nobody knows
+    from ihbench.scene.sightings import Sightings
 
 
 @dataclass(frozen=True)
@@ -64,6 +58,13 @@ class TrainingSet:
     body: Body
     background: tuple[float, float, float]  # RGB in [0, 1]
     name: str  # the scene's name, for messages only
+
+    @cached_property
+    def sightings(self) -> dict[int, Sightings]:
+        """What the views show of the body's surface, on a UV grid of each side in `scene.sightings`."""
+        from ihbench.scene.sightings import look_through
+
+        return look_through(self.views, self.body)
 
 
 class Capture(Protocol):

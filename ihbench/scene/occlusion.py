@@ -78,23 +78,21 @@ class OcclusionPlan:
     covered: tuple[bool, ...]
     silhouette: Callable[[int], Mask]  # raw frame number -> [H, W] of the training camera, original image
     in_scene: bool  # the occluder stands in the scene; see `occluder`
-    body_mask: Callable[[int], Mask]  # raw frame number -> [H, W] the projected body, training camera
     in_test: Callable[[int], Occlusion]  # camera -> what the occluder hides of its test images; only where in_scene
+    pixels: Callable[[int], tuple[int, int]]  # raw frame number -> person pixels, and how many of them are hidden
 
     def hidden_share(self, frames: Sequence[int] | None = None) -> float:
         """Share of the pooled person pixels of the covered training frames that is hidden, original pixels; over some
         of the training frames where they are named. Where the occluder stands in the scene nobody knows the person
         behind it: the projected body stands for what is hidden of them."""
-        chosen = self.frames if frames is None else frames
-        person = hidden = 0
-        for frame, covered in zip(self.frames, self.covered, strict=True):
-            if covered and frame in chosen:
-                silhouette = self.silhouette(frame)
-                if self.in_scene:
-                    silhouette = silhouette | self.body_mask(frame)
-                person += int(silhouette.sum())
-                hidden += int((silhouette & self.occlusion.hidden(frame)).sum())
-        return hidden / person if person else 0.0
+        chosen = set(self.frames if frames is None else frames)
+        counts = [
+            self.pixels(frame)
+            for frame, covered in zip(self.frames, self.covered, strict=True)
+            if covered and frame in chosen
+        ]
+        person = sum(count for count, _ in counts)
+        return sum(hidden for _, hidden in counts) / person if person else 0.0
 
 
 def apply_rule(protocol: Protocol, capture: Capture) -> OcclusionPlan:
@@ -138,15 +136,17 @@ def apply_rule(protocol: Protocol, capture: Capture) -> OcclusionPlan:
         return rule(request(camera, own, [True] * len(own)))
 
     training = request(protocol.train.camera, frames, covered)
-    return OcclusionPlan(
-        rule(training),
-        tuple(frames),
-        tuple(covered),
-        training.silhouette,
-        in_scene,
-        training.body_mask,
-        in_test,
-    )
+    occlusion = rule(training)
+
+    @cache
+    def pixels(frame: int) -> tuple[int, int]:
+        silhouette = training.silhouette(frame)
+        if in_scene:
+            silhouette = silhouette | training.body_mask(frame)
+        return int(silhouette.sum()), int((silhouette & occlusion.hidden(frame)).sum())
+
+    silhouette = training.silhouette
+    return OcclusionPlan(occlusion, tuple(frames), tuple(covered), silhouette, in_scene, in_test, pixels)
 
 
 def withheld(regions: Iterable[str]) -> dict[str, str]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 from ihbench.body.pose import BodyPose
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera
+from ihbench.render.triangles import triangle_areas
 from ihbench.scene.contracts import Capture, MaskState
-from ihbench.scene.occlusion import OcclusionPlan, apply_rule, withheld
+from ihbench.scene.occlusion import OcclusionPlan, withheld
 from ihbench.scene.protocol import Protocol
+from ihbench.scene.views import OccludedScene
 from ihbench.scene.visibility import Visibility, texel_visibility
-
-if TYPE_CHECKING:
-    from ihbench.body import Body
 
 MEASURE_SIZE = 256  # px; visibility is measured on images reduced to about this
 MEASURE_VIEWS = 50  # at most this many training views, evenly spaced
@@ -77,11 +76,11 @@ class _MaskView:
     body_pose: BodyPose
 
 
-def measure_scene(capture: Capture, protocol: Protocol, body: Body) -> SceneMeasure:
+def measure_scene(scene: OccludedScene) -> SceneMeasure:
     """Measure one capture under a protocol. Reads masks of at most `MEASURE_VIEWS` training views, no images."""
     from ihbench.body.uv import texel_table
 
-    hiding = apply_rule(protocol, capture)
+    capture, protocol, hiding, body = scene.capture, scene.protocol, scene.hiding, scene.capture.model
     frames = hiding.frames
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(MEASURE_VIEWS, len(frames))).round().astype(int))
     views = [_mask_view(capture, protocol, hiding, k) for k in chosen]
@@ -92,8 +91,7 @@ def measure_scene(capture: Capture, protocol: Protocol, body: Body) -> SceneMeas
     depth = float(np.median([camera.to_camera(body.posed_joints(view.body_pose))[:, 2].mean() for view in views]))
     focal = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
     focal *= protocol.image.size / max(camera.width, camera.height)
-    corners = body.pose(views[0].body_pose)[body.faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
+    area = triangle_areas(body.pose(views[0].body_pose)[body.faces]).sum()
     filled = len(texels.face) / TEXELS**2
     return SceneMeasure(
         training_views=len(frames),

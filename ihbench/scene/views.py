@@ -10,6 +10,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from threading import Lock
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -20,7 +21,7 @@ from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.errors import BadInput
 from ihbench.metrics.images import bounds
-from ihbench.scene.contracts import Capture, MaskState, TestView, TrainView
+from ihbench.scene.contracts import Capture, MaskState, TestView, TrainingSet, TrainView
 from ihbench.scene.occlusion import OcclusionPlan, apply_rule, grown_for_clothes
 from ihbench.scene.protocol import ImageRule, Protocol
 
@@ -130,6 +131,11 @@ class OccludedScene:
     train: LazyViews[TrainView]
     test_keys: tuple[TestViewKey, ...]
     test: LazyViews[TestView]
+
+    @cached_property
+    def training(self) -> TrainingSet:
+        """What the method gets."""
+        return TrainingSet(self.train, self.capture.model, self.protocol.image.background, self.capture.name)
 
 
 def straight_camera(camera: Camera, rule: ImageRule) -> Camera:
@@ -266,7 +272,7 @@ def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
     protocol.check_views(capture.name, capture.n_frames, n_cameras, f"{capture.dataset} {capture.name}")
     hiding = apply_rule(protocol, capture)
     frames, covered = hiding.frames, hiding.covered
-    lenses = {protocol.train.camera: Undistorter(capture.camera(protocol.train.camera), protocol.image)}
+    lenses = LazyViews(lambda camera: Undistorter(capture.camera(camera), protocol.image), n_cameras, held=n_cameras)
     last_touched: dict[int, tuple[NDArray[np.bool_], NDArray[np.bool_]]] = {}  # most rules hide the same every time
 
     def hidden_of(frame: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -306,8 +312,6 @@ def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
 
     def test_view(k: int) -> TestView:
         key = keys[k]
-        if key.camera not in lenses:
-            lenses[key.camera] = Undistorter(capture.camera(key.camera), protocol.image)
         lens, person = lenses[key.camera], silhouette(key.camera, key.frame)
         image, mask = lens.person(capture.image(key.camera, key.frame), person)
         hidden = None

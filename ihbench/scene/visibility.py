@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
+from ihbench.render.triangles import triangle_normals
 from ihbench.render.zbuffer import rasterize
-from ihbench.scene.contracts import MaskState
+from ihbench.scene.mask_state import MaskState
 
 if TYPE_CHECKING:
     from ihbench.body import Body
@@ -42,6 +43,23 @@ class Visibility:
     faced: NDArray[np.int32]  # [N] views in which the texel was the nearest surface, occluder ignored
     seen: NDArray[np.int32]  # [N] views in which its pixel also showed the visible person
 
+    @classmethod
+    def none(cls, count: int) -> Visibility:
+        """Of so many texels, before any view is counted."""
+        return cls(np.zeros(count, np.int32), np.zeros(count, np.int32))
+
+    def count(
+        self,
+        faced: FacedTexels,
+        mask: NDArray[np.uint8],  # [H, W] MaskState
+    ) -> NDArray[np.uint8]:
+        """Count one more view; gives the MaskState [n] of the faced texels' pixels."""
+        state = mask[faced.pixel]
+        # a texel over known background is neither: the fitted body sticks out of the person there
+        self.faced[faced.texel] += state != MaskState.BACKGROUND
+        self.seen[faced.texel] += state == MaskState.PERSON
+        return state
+
     @property
     def visible(self) -> NDArray[np.bool_]:
         """[N] seen un-occluded in at least one training view."""
@@ -58,39 +76,53 @@ class Visibility:
         return self.faced == 0
 
 
-def surface_texels(
-    vertices: NDArray[np.float64],  # [V, 3] m world
-    body: Body,
-    texels: Texels,
-    view: MaskedView,
-) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """(nearest [N], row [N], column [N], cosine [N]): texels that are the nearest surface in this view and not seen
-    too obliquely, their pixels, and the cosine between normal and direction to the camera."""
-    camera = view.camera
-    projected = camera.project(vertices)
-    depth = rasterize(projected, body.faces, camera.height, camera.width).depth
-    corners = vertices[body.faces[texels.face]]  # [N, 3, 3]
-    points = np.einsum("nk,nkd->nd", texels.bary, corners)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
-    to_camera = camera.center - points
-    to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
-    p = camera.project(points)
-    inside = (p[:, 2] > 0) & (p[:, 0] >= 0) & (p[:, 0] < camera.width) & (p[:, 1] >= 0) & (p[:, 1] < camera.height)
-    column = np.where(inside, p[:, 0], 0).astype(np.int64)
-    row = np.where(inside, p[:, 1], 0).astype(np.int64)
-    cosine = (normals * to_camera).sum(1)
-    return inside & (cosine > FACING) & (p[:, 2] <= depth[row, column] + DEPTH_SLACK), row, column, cosine
+@dataclass(frozen=True)
+class FacedTexels:
+    """Texels that are the nearest surface in a view, occluder ignored, and not seen too obliquely: n of the N."""
+
+    texel: NDArray[np.int64]  # [n] numbers in the texel table, ascending
+    xy: NDArray[np.float64]  # [n, 2] px where the view shows them, pixel centres at +0.5
+    cosine: NDArray[np.float64]  # [n] between the normal and the direction to the camera
+
+    @property
+    def pixel(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Row [n] and column [n] of the pixels that show them."""
+        column, row = self.xy.astype(np.int64).T
+        return row, column
+
+
+class PosedSurface:
+    """The body before the camera of one view, with its z-buffer: asked for the texels of as many grids as needed."""
+
+    def __init__(self, body: Body, camera: Camera, body_pose: BodyPose):
+        self.camera = camera
+        vertices = body.pose(body_pose)
+        self._depth = rasterize(camera.project(vertices), body.faces, camera.height, camera.width).depth
+        self._corners = vertices[body.faces]
+        self._normals = triangle_normals(self._corners)
+        self._front = (self._normals * (camera.center - self._corners[:, 0])).sum(1) > 0
+
+    def faced(self, texels: Texels) -> FacedTexels:
+        camera = self.camera
+        texel = np.flatnonzero(self._front[texels.face])
+        face = texels.face[texel]
+        points = np.einsum("nk,nkd->nd", texels.bary[texel], self._corners[face])
+        to_camera = camera.center - points
+        to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
+        cosine = (self._normals[face] * to_camera).sum(1)
+        facing = cosine > FACING
+        texel, cosine = texel[facing], cosine[facing]
+        p = camera.project(points[facing])
+        inside = (p[:, 2] > 0) & (p[:, :2] >= 0).all(1) & (p[:, 0] < camera.width) & (p[:, 1] < camera.height)
+        texel, cosine, p = texel[inside], cosine[inside], p[inside]
+        column, row = p[:, :2].astype(np.int64).T
+        nearest = p[:, 2] <= self._depth[row, column] + DEPTH_SLACK
+        return FacedTexels(texel[nearest], p[nearest, :2], cosine[nearest])
 
 
 def texel_visibility(views: Iterable[MaskedView], body: Body, texels: Texels) -> Visibility:
     """Count, for every texel, the training views that faced it and those that showed it."""
-    faced = np.zeros(len(texels.face), np.int32)
-    seen = np.zeros(len(texels.face), np.int32)
+    seen = Visibility.none(len(texels.face))
     for view in views:
-        nearest, row, column, _ = surface_texels(body.pose(view.body_pose), body, texels, view)
-        state = view.mask[row, column]
-        # a texel over known background is neither: the fitted body sticks out of the person there
-        faced += nearest & (state != MaskState.BACKGROUND)
-        seen += nearest & (state == MaskState.PERSON)
-    return Visibility(faced, seen)
+        seen.count(PosedSurface(body, view.camera, view.body_pose).faced(texels), view.mask)
+    return seen

@@ -17,12 +17,11 @@ from ihbench.body.pose import BodyPose
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera
 from ihbench.render.zbuffer import rasterize
-from ihbench.scene.contracts import MaskState, TestView, TrainView
-from ihbench.scene.visibility import surface_texels
+from ihbench.scene.contracts import MaskState, TestView, TrainingSet, TrainView
+from ihbench.scene.sightings import FINE
 
 if TYPE_CHECKING:
     from ihbench.body import Body
-    from ihbench.body.uv import Texels
 
 ROWS = ("truth", "truth-8bit", "nearest-frame", "mean-colour-body", "pasted-texture")
 DESCRIPTIONS = {
@@ -46,29 +45,23 @@ class Calibration:
     texture: NDArray[np.float32]  # [R, R, 3]
 
     @classmethod
-    def build(
-        cls, views: Sequence[TrainView], body: Body, texels: Texels, background: tuple[float, float, float]
-    ) -> Calibration:
+    def build(cls, training: TrainingSet) -> Calibration:
         """Average the visible colour of every texel over the training views."""
         from ihbench.body.uv import chart_padding
 
-        total = np.zeros((len(texels.face), 3))
-        count = np.zeros(len(texels.face))
         person_sum, person_count = np.zeros(3), 0
-        for view in views:
-            nearest, row, column, _ = surface_texels(body.pose(view.body_pose), body, texels, view)
-            seen = nearest & (view.mask[row, column] == MaskState.PERSON)
-            total[seen] += view.image[row[seen], column[seen]]
-            count += seen
+        for view in training.views:
             person = view.mask == MaskState.PERSON
             person_sum += view.image[person].sum(0, dtype=np.float64)
             person_count += int(person.sum())
         mean = person_sum / max(person_count, 1) / 255
-        color = np.where(count[:, None] > 0, total / np.maximum(count, 1)[:, None] / 255, mean)
+        surface = training.sightings[FINE]
+        count, texels = surface.visibility.seen[:, None], surface.texels
         flat = np.zeros((texels.resolution**2, 3), np.float32)
-        flat[texels.index] = color
+        flat[texels.index] = np.where(count > 0, surface.colour / np.maximum(count, 1) / 255, mean)
         texture = flat[chart_padding(texels.mask, texels.resolution)]
-        return cls(body, views, np.asarray(background, np.float32), mean.astype(np.float32), texture)
+        background = np.asarray(training.background, np.float32)
+        return cls(training.body, training.views, background, mean.astype(np.float32), texture)
 
     def predict(self, row: str, view: TestView) -> NDArray[np.float32]:
         """[H, W, 3] the row's image of a test view."""

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,14 +22,9 @@ from ihbench.metrics.images import as_image, check_range
 from ihbench.scene.contracts import TestView
 from ihbench.scene.occlusion import withheld
 from ihbench.scene.regions import SurfaceMap
+from ihbench.scene.sightings import FINE
 from ihbench.scene.views import OccludedScene, TestViewKey
-from ihbench.scene.visibility import Visibility, texel_visibility
 
-if TYPE_CHECKING:
-    from ihbench.body import Body
-    from ihbench.body.uv import Texels
-
-VISIBILITY_TEXELS = 256  # side of the UV grid on which "seen in training" is decided
 AHEAD = 3  # test views read in the background while one is predicted
 MOST_WORKERS = 8  # threads; each holds a view
 # A renderer without a last clamp leaves [0, 1] in places; presets clip that or take it as it is. Beyond this a whole
@@ -73,22 +68,17 @@ class Scorer:
 
     scene: OccludedScene
     surface: SurfaceMap
-    texels: Texels
-    visibility: Visibility
     presets: tuple[Preset, ...]
 
     @classmethod
-    def build(cls, scene: OccludedScene, body: Body, presets: Sequence[str] | None = None) -> Scorer:
+    def build(cls, scene: OccludedScene, presets: Sequence[str] | None = None) -> Scorer:
         """Decide from the training views what was seen of the surface. The presets are the protocol's own by default.
 
         Raises `BadInput` for an unknown preset.
         """
-        from ihbench.body.uv import texel_table
-
         found = tuple(find_preset(name) for name in presets or scene.protocol.metrics.presets)
-        texels = texel_table(body, VISIBILITY_TEXELS)
-        visibility = texel_visibility(scene.train, body, texels)
-        return cls(scene, SurfaceMap.build(body, texels, visibility), texels, visibility, found)
+        seen = scene.training.sightings[FINE]
+        return cls(scene, SurfaceMap.build(scene.capture.model, seen.texels, seen.visibility), found)
 
     @cached_property
     def withheld(self) -> dict[str, str]:

@@ -67,7 +67,7 @@ def protocol_for(capture: DrawnCapture, **options: Any) -> Protocol:
 
 
 def _scorer(capture: DrawnCapture, protocol: Protocol) -> Scorer:
-    return Scorer.build(open_scene(capture, protocol), the_body())
+    return Scorer.build(open_scene(capture, protocol))
 
 
 @cache
@@ -137,8 +137,8 @@ def _hidden_share(fraction: float) -> Answer:
 def _one_frame() -> Answer:
     capture = turning_capture(1)
     protocol = protocol_for(capture, rule="none")
-    measure = measure_scene(capture, protocol, the_body())
     scene = open_scene(capture, protocol)
+    measure = measure_scene(scene)
     return Answer([len(scene.train), measure.motion_deg, measure.turn_deg], [1, 0, 0])
 
 
@@ -190,7 +190,7 @@ def _whole_turn() -> Answer:
         rotations += 2 * math.pi * k * np.divide(rotations, length, out=np.zeros_like(rotations), where=length > 0)
         poses.append(replace(pose, pose=rotations))
     capture = DrawnCapture(poses, turning_capture(1).cameras)
-    measure = measure_scene(capture, protocol_for(capture, rule="none"), the_body())
+    measure = measure_scene(open_scene(capture, protocol_for(capture, rule="none")))
     return Answer([measure.motion_deg, measure.turn_deg], 0, math.inf)
 
 
@@ -267,7 +267,7 @@ def _no_color() -> Answer:
     capture = turning_capture(FRAMES)
     scorer = _scorer(capture, protocol_for(capture, strip=EVERYTHING))
     hidden = [view for view, covered in zip(scorer.scene.train, scorer.scene.hiding.covered, strict=True) if covered]
-    calibration = Calibration.build(hidden, the_body(), scorer.texels, WHITE)
+    calibration = Calibration.build(replace(scorer.scene.training, views=hidden))
     view = scorer.load(0).view
     rows = [calibration.predict(row, view) for row in ("nearest-frame", "mean-colour-body", "pasted-texture")]
     return Answer(int((~np.isfinite(np.stack(rows))).sum()), 0)

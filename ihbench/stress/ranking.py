@@ -23,7 +23,7 @@ from ihbench.metrics.evaluate import Preset, evaluate, find_preset
 from ihbench.metrics.identity import metric_of
 from ihbench.scoring.calibration import Calibration
 from ihbench.stress.case import Answer, Case
-from ihbench.stress.drawn_capture import SIZE, small_protocol, the_body, turning_capture
+from ihbench.stress.drawn_capture import SIZE, small_protocol, turning_capture
 
 Image = NDArray[np.float32]  # [H, W, 3] in [0, 1]
 Color = tuple[float, float, float]
@@ -94,8 +94,8 @@ def field(background: Color = WHITE) -> tuple[Frame, ...]:
     capture = turning_capture(6)
     protocol = small_protocol(n_frames=6, size=SIZE)
     protocol = replace(protocol, image=replace(protocol.image, background=background))
-    scorer = Scorer.build(open_scene(capture, protocol), the_body())
-    calibration = Calibration.build(scorer.scene.train, the_body(), scorer.texels, background)
+    scorer = Scorer.build(open_scene(capture, protocol))
+    calibration = Calibration.build(scorer.scene.training)
     paint = np.asarray(background, np.float32)
     frames = []
     for index in (0, 2, 3, 5):

@@ -13,7 +13,7 @@ from ihbench.diffusion.crops.part_map import smpl_parts
 from ihbench.diffusion.inpaint_config import Filler
 from ihbench.methods.inpainthuman.inpainting.colour_fills import GREY, MeanColour, NavierStokes, Telea
 from ihbench.methods.inpainthuman.inpainting.fillers import fillers
-from ihbench.methods.inpainthuman.inpainting.surface_colours import faced_texels, off_the_rim, pixel_texels
+from ihbench.methods.inpainthuman.inpainting.surface_colours import counted_colours, off_the_rim, pixel_texels
 from ihbench.methods.inpainthuman.inpainting.texture_fills import (
     MirroredTexture,
     TemporalCopy,
@@ -21,6 +21,7 @@ from ihbench.methods.inpainthuman.inpainting.texture_fills import (
     nearest_colours,
 )
 from ihbench.metrics import psnr
+from ihbench.scene.visibility import PosedSurface
 from tests.bench.fake_capture import the_body
 
 from .hidden_person import (
@@ -150,7 +151,7 @@ def test_opencv_knows_nothing_but_the_crop(filler, views):
 
 def test_a_texel_and_the_pixel_that_shows_it_find_each_other(views):
     view, texels = views[1], texel_table(BODY, TEXELS)
-    faced, shown = faced_texels(view, BODY, texels), pixel_texels(view, BODY, texels)
+    faced, shown = PosedSurface(BODY, view.camera, view.body_pose).faced(texels), pixel_texels(view, BODY, texels)
     assert np.array_equal(shown >= 0, view.body)
     points = texels.interpolate(BODY.pose(view.body_pose), BODY.faces)
     column, row = faced.xy.astype(int).T
@@ -165,14 +166,14 @@ def test_a_texel_and_the_pixel_that_shows_it_find_each_other(views):
 
 def test_colours_are_sampled_from_counted_pixels_only(views):
     view, texels = views[1], texel_table(BODY, TEXELS)
-    faced, counted = faced_texels(view, BODY, texels), view.person & off_the_rim(view)
-    texel, rgb = faced.colours(view.image, counted)
+    faced, counted = PosedSurface(BODY, view.camera, view.body_pose).faced(texels), view.person & off_the_rim(view)
+    texel, rgb = counted_colours(faced, view.image, counted)
     dirty = np.where(counted[..., None], view.image, np.uint8(0))
-    assert np.array_equal(faced.colours(dirty, counted)[1], rgb)
+    assert np.array_equal(counted_colours(faced, dirty, counted)[1], rgb)
     true = 255 * texels.interpolate(pattern(), BODY.faces)[texel]
     assert np.abs(rgb - true).mean() < 4
     flat = np.full_like(view.image, 77)
-    assert (faced.colours(flat, counted)[1] == 77).all()
+    assert (counted_colours(faced, flat, counted)[1] == 77).all()
 
 
 def test_the_rim_is_where_a_neighbour_is_background(views):

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ihbench.body.uv import texel_table
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.clock.threads import one_torch_thread
@@ -16,10 +15,9 @@ from ihbench.diffusion.inpaint_config import InpaintConfig
 from ihbench.methods.inpainthuman.inpainting.painted_view import paste_back
 from ihbench.methods.inpainthuman.inpainting.shown_view import orbit, turntable_view, with_known_surface
 from ihbench.methods.inpainthuman.inpainting.surface_need import SeenSurface, key_views, pixels_of, seen_surface
-from ihbench.methods.inpainthuman.stages import stage2
 from ihbench.methods.inpainthuman.stages.stage2 import Stage2
 from ihbench.scene.contracts import MaskState
-from ihbench.scene.visibility import surface_texels
+from ihbench.scene.visibility import PosedSurface
 from tests.bench.fake_capture import a_camera, a_pose, the_body, train_view
 from tests.methods.tiny_fit import SIZE, an_avatar, shaken, training_set, training_views
 
@@ -47,7 +45,7 @@ def red(view, at):
 class TestNeed:
     def test_a_strip_that_never_moves_hides_its_surface(self):
         training = one_sided()
-        surface = seen_surface(training, 64)
+        surface = seen_surface(training)
         view = training.views[0]
         unseen = pixels_of(surface.map_of(surface.unseen), the_body().pose(view.body_pose), the_body(), view.camera)
         hidden, body = view.mask == MaskState.UNKNOWN, view.mask == MaskState.PERSON
@@ -56,7 +54,7 @@ class TestNeed:
 
     def test_nothing_is_needed_where_another_view_shows_it(self):
         views = [*one_sided().views, train_view(a_camera(0.0, SIZE), a_pose(0.0, 0.0), None, frame=9)]
-        surface = seen_surface(training_set(views), 64)
+        surface = seen_surface(training_set(views))
         view = views[0]
         unseen = pixels_of(surface.map_of(surface.unseen), the_body().pose(view.body_pose), the_body(), view.camera)
         hidden = view.mask == MaskState.UNKNOWN
@@ -72,11 +70,11 @@ class TestNeed:
 
     def test_surface_seen_at_a_glancing_angle_only_needs_no_painter(self):
         training = one_sided()
-        everything, well = (seen_surface(training, 64, facing) for facing in (0.0, 0.7))
+        everything, well = (seen_surface(training, facing) for facing in (0.0, 0.7))
         best = np.zeros(len(well.views))
         for view in training.views:
-            nearest, *_, cosine = surface_texels(the_body().pose(view.body_pose), the_body(), well.texels, view)
-            best = np.maximum(best, np.where(nearest, cosine, 0))
+            faced = PosedSurface(the_body(), view.camera, view.body_pose).faced(well.texels)
+            best[faced.texel] = np.maximum(best[faced.texel], faced.cosine)
         assert (everything.unseen == well.unseen).all()
         assert (everything.needed <= everything.unseen).all()
         assert (well.needed == everything.needed & (best >= 0.7)).all()
@@ -96,7 +94,7 @@ class TestShown:
     def test_only_unseen_surface_stays_unknown(self):
         views = training_views()
         training = training_set(views)
-        surface = seen_surface(training, 64)
+        surface = seen_surface(training)
         avatar = shaken(an_avatar())
         shown = with_known_surface(views[1], training, avatar, surface)
         was, is_now = views[1].mask == MaskState.UNKNOWN, shown.mask == MaskState.UNKNOWN
@@ -109,7 +107,7 @@ class TestShown:
 
     def test_a_turntable_view_asks_for_the_side_nobody_filmed(self):
         training = one_sided(hidden=None)
-        surface = seen_surface(training, 64)
+        surface = seen_surface(training)
         avatar = an_avatar()
         front, back = (turntable_view(angle, training.views[0], training, avatar, surface) for angle in (0.0, np.pi))
         body = [(view.mask != MaskState.BACKGROUND).sum() for view in (front, back)]
@@ -267,11 +265,10 @@ class TestStage2:
 
 
 def test_a_map_of_texels_reaches_beyond_the_charts():
-    surface = seen_surface(one_sided(), 64)
+    surface = seen_surface(one_sided())
     assert isinstance(surface, SeenSurface)
-    table = texel_table(the_body(), 64)
+    table = surface.texels
     on = table.mask
     unseen = surface.map_of(surface.unseen)
     assert (unseen[on] == (surface.views == 0)).all()
     assert unseen[~on].any()
-    assert stage2.TEXELS >= 64

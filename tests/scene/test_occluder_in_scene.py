@@ -102,7 +102,7 @@ def left_the_photograph(view, capture):
 def test_what_a_lens_reaches_beyond_the_photograph_is_not_known(rule):
     whole, _ = behind_a_table(PINCUSHION, (0.5, 0.5, 0.0))
     scene = open_scene(whole, fake_protocol("zju_occ", 6, 96, rule))
-    scorer, lost = Scorer.build(scene, the_body()), 0
+    scorer, lost = Scorer.build(scene), 0
     for view in scene.train:
         beyond = left_the_photograph(view, whole)
         lost += beyond.sum()
@@ -151,7 +151,7 @@ def test_a_complete_avatar_never_scores_below_the_same_avatar_with_a_hole(rule, 
             open_scene(replace(capture, visible_masks=True), protocol)
         return
     complete = open_scene(whole, fake_protocol("zju_occ", 6, 96, "none")).test
-    scorer = Scorer.build(open_scene(capture, protocol), the_body(), PRESETS)
+    scorer = Scorer.build(open_scene(capture, protocol), PRESETS)
     rng, compared = np.random.default_rng(0), 0
     for k in (0, 1):
         loaded = scorer.load(k)
@@ -171,7 +171,7 @@ def test_a_complete_avatar_never_scores_below_the_same_avatar_with_a_hole(rule, 
 def test_what_is_hidden_of_a_test_view_is_in_no_region_and_moves_no_number():
     _, capture = behind_a_table(DISTORTION)
     protocol = natural("zju_occ", 96)
-    scorer = Scorer.build(open_scene(capture, protocol), the_body(), PRESETS)
+    scorer = Scorer.build(open_scene(capture, protocol), PRESETS)
     loaded = scorer.load(0)
     hidden = loaded.view.hidden
     assert hidden is not None
@@ -266,7 +266,7 @@ def test_a_third_party_rule_is_treated_alike(curtain):
     scene = open_scene(capture, protocol)
     assert all(scene.hiding.covered)
     assert not any((view.mask == MaskState.BACKGROUND).any() for view in scene.train)
-    assert Scorer.build(scene, the_body()).withheld.keys() == {"full", "box"}
+    assert Scorer.build(scene).withheld.keys() == {"full", "box"}
     with pytest.raises(BadInput, match="nobody knows what is behind it"):
         uncovered(scene)
 

@@ -51,7 +51,7 @@ BODY = the_body()
 
 def measured(capture, **changes):
     protocol = replace(fake_protocol(n_frames=capture.n_frames), **changes)
-    return measure_scene(capture, protocol, BODY)
+    return measure_scene(open_scene(capture, protocol))
 
 
 def capture_of(roots=None, joint=None):
@@ -89,8 +89,8 @@ def test_shares_are_a_partition_of_the_surface(moving):
 @pytest.mark.parametrize("distortion", [None, DISTORTION], ids=["pinhole", "distorted"])
 def test_what_is_measured_on_raw_masks_holds_on_the_views_a_method_gets(distortion):
     capture, protocol = turning(distortion=distortion), fake_protocol(size=SIZE)
-    found = measure_scene(capture, protocol, BODY)
     scene = open_scene(capture, protocol)
+    found = measure_scene(scene)
     seen = texel_visibility(scene.train, BODY, texel_table(BODY, TEXELS))
     assert found.visible_texels == pytest.approx(seen.visible.mean(), abs=0.04)
     assert found.hidden_texels == pytest.approx(seen.hidden.mean(), abs=0.04)

@@ -9,7 +9,7 @@ from ihbench.body import JOINT_INDEX, texel_table
 from ihbench.body.pose import BodyPose
 from ihbench.camera import look_at
 from ihbench.scene.contracts import MaskState
-from ihbench.scene.visibility import FACING, surface_texels, texel_visibility
+from ihbench.scene.visibility import FACING, PosedSurface, texel_visibility
 from tests.bench.fake_capture import DISTORTION, SIZE, a_camera, a_pose, the_body, train_view
 
 RESOLUTION = 64
@@ -66,7 +66,8 @@ def test_a_ray_caster_agrees(distortion):
     """From the side an arm hangs close before the body. The z-buffer knows depth at pixel centres only, hence the
     slack of a few percent near outlines."""
     camera, pose = a_camera(1.2, 256, distortion=distortion), arms_down()
-    nearest, row, column, _ = surface_texels(BODY.pose(pose), BODY, TEXELS, train_view(camera, pose))
+    faced = PosedSurface(BODY, camera, pose).faced(TEXELS)
+    nearest = np.isin(np.arange(len(TEXELS.face)), faced.texel)
     place, facing = TEXELS.interpolate(BODY.v_template, BODY.faces), cosine(camera, pose)
     trunk = (np.abs(place[:, 0]) < 0.22) & (place[:, 1] > -0.1) & (place[:, 1] < 0.45)
     chosen = np.flatnonzero(trunk & (facing > FACING))
@@ -79,7 +80,7 @@ def test_a_ray_caster_agrees(distortion):
     assert shown.sum() > 80
     assert nearest[chosen][shown].mean() > 0.97
     pixels = camera.project(surface(pose)[0])[nearest, :2]
-    np.testing.assert_array_equal(np.floor(pixels), np.column_stack([column[nearest], row[nearest]]))
+    np.testing.assert_array_equal(np.floor(pixels), np.column_stack(faced.pixel[::-1]))
 
 
 def test_what_faces_away_is_never_seen():

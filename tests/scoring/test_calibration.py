@@ -5,21 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ihbench.body import texel_table
 from ihbench.metrics import psnr
-from ihbench.scene.contracts import MaskState
+from ihbench.scene.contracts import MaskState, TrainingSet
 from ihbench.scoring.calibration import DESCRIPTIONS, ROWS, Calibration
 from tests.bench.fake_capture import SIZE, WHITE, a_camera, a_pose, rasterized, the_body, train_view, truth_view
 
 BODY = the_body()
-TEXELS = texel_table(BODY, 256)
 CENTRE = slice(SIZE // 2 - 4, SIZE // 2 + 4)
 HEADINGS = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
 BLUE = (0.2, 0.4, 1.0)
 
 
 def calibration(views, background=WHITE):
-    return Calibration.build(views, BODY, TEXELS, background)
+    return Calibration.build(TrainingSet(views, BODY, background, "calibration"))
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from ihbench.scene.views import open_scene
 from ihbench.scoring.calibration import Calibration
 from ihbench.scoring.curve_views import curve_views, representatives
 from ihbench.scoring.scoring import Scorer
-from tests.bench.fake_capture import a_camera, fake_protocol, the_body, turning_capture
+from tests.bench.fake_capture import a_camera, fake_protocol, turning_capture
 
 
 @settings(max_examples=40, deadline=None)
@@ -49,8 +49,8 @@ def studio(request):
     capture = replace(capture, cameras=[a_camera(2 * np.pi * k / 11) for k in range(11)])
     protocol = fake_protocol("zju_occ", 20, 48, rule)
     protocol = replaced(protocol, {"test.frames": Span(0, 20, 4), "test.cameras": TestCameras(0, 11, 1, False)})
-    scorer = Scorer.build(open_scene(capture, protocol), the_body())
-    pasted = Calibration.build(scorer.scene.train, the_body(), scorer.texels, (1.0, 1.0, 1.0))
+    scorer = Scorer.build(open_scene(capture, protocol))
+    pasted = Calibration.build(scorer.scene.training)
     rows = {"pasted": lambda loaded: pasted.predict("pasted-texture", loaded.view)}
     views = [x.scores["pasted"].scores for x in scorer.scored(rows, range(55), slow=False)]
     return scorer, views
@@ -80,7 +80,7 @@ def test_of_few_views_all_are_taken_and_groups_stand_apart():
     capture = turning_capture(10)
     protocol = fake_protocol("zju_occ", 10)
     protocol = replace(protocol, also=(TestGroup("again", Cameras(0, 4, 1), Span(0, 10, 1)),))
-    scorer = Scorer.build(open_scene(capture, protocol), the_body())
+    scorer = Scorer.build(open_scene(capture, protocol))
     own = sum(not key.group for key in scorer.scene.test_keys)
     assert own < len(scorer.scene.test_keys)
     assert curve_views(scorer, own) == curve_views(scorer, 500) == list(range(own))
@@ -89,7 +89,7 @@ def test_of_few_views_all_are_taken_and_groups_stand_apart():
 
 def test_of_a_long_video_a_few_frames_are_looked_at(monkeypatch):
     monkeypatch.setattr("ihbench.scoring.curve_views.MOST_FRAMES", 8)
-    scorer = Scorer.build(open_scene(turning_capture(40), fake_protocol("zju_occ", 40)), the_body())
+    scorer = Scorer.build(open_scene(turning_capture(40), fake_protocol("zju_occ", 40)))
     chosen = curve_views(scorer, 6)
     frames = [scorer.scene.test_keys[k].frame for k in chosen]
     assert len(set(frames)) >= 5

@@ -12,7 +12,6 @@ from ihbench.errors import BadInput
 from ihbench.scene.protocol import REGIONS
 from ihbench.scene.views import open_scene
 from ihbench.scene.visibility import texel_visibility
-from ihbench.scoring import scoring
 from ihbench.scoring.scoring import Scorer
 from tests.bench.fake_capture import fake_protocol, the_body, turning_capture
 
@@ -30,9 +29,7 @@ def scorer(reads):
         reads[camera, frame] += 1
         return pixels
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scoring, "VISIBILITY_TEXELS", 64)
-        yield Scorer.build(open_scene(replace(turning_capture(), edit_image=count), fake_protocol()), BODY)
+    return Scorer.build(open_scene(replace(turning_capture(), edit_image=count), fake_protocol()))
 
 
 def region_of(identity):
@@ -40,9 +37,10 @@ def region_of(identity):
 
 
 def test_what_was_seen_is_decided_by_the_training_views(scorer):
-    expected = texel_visibility(scorer.scene.train, BODY, scorer.texels)
-    assert np.array_equal(scorer.visibility.seen, expected.seen)
-    assert np.array_equal(scorer.visibility.faced, expected.faced)
+    for seen in scorer.scene.training.sightings.values():
+        expected = texel_visibility(scorer.scene.train, BODY, seen.texels)
+        assert np.array_equal(seen.visibility.seen, expected.seen)
+        assert np.array_equal(seen.visibility.faced, expected.faced)
 
 
 def test_the_truth_scores_perfectly_and_a_grey_image_does_not(scorer):
@@ -151,7 +149,7 @@ def test_a_view_without_a_prediction_is_absent_in_everything(scorer):
 
 
 def test_a_presets_own_regions_are_provided(scorer):
-    legacy = Scorer.build(scorer.scene, BODY, ["occnerf", "gauhuman"])
+    legacy = Scorer.build(scorer.scene, ["occnerf", "gauhuman"])
     loaded = legacy.load(0)
     scores = legacy.score(loaded, loaded.view.image, slow=False).scores
     assert "psnr/occnerf-pooled/range1/box+0.3/v1" in scores

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 
 import cv2
@@ -14,35 +13,17 @@ from ihbench.body import Body
 from ihbench.body.uv import Texels, map_coordinates, texel_table
 from ihbench.diffusion.crops.crop_view import CropView
 from ihbench.render.zbuffer import rasterize
-from ihbench.scene.contracts import MaskState, TrainView
-from ihbench.scene.visibility import surface_texels
+from ihbench.scene.visibility import FacedTexels
 
 
-@dataclass(frozen=True)
-class FacedTexels:
-    """Texels that are the nearest surface in a crop, occluder ignored, and where the crop shows them."""
-
-    texel: NDArray[np.int32]  # [n] numbers in the texel table, ascending
-    xy: NDArray[np.float64]  # [n, 2] px, pixel centres at +0.5
-
-    def colours(
-        self,
-        image: NDArray[np.uint8],  # [S, W, 3]
-        counted: NDArray[np.bool_],  # [S, W]
-    ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-        """Texels [m] whose pixel counts, ascending, and their RGB [m, 3] in 0..255: bilinear over counted pixels."""
-        column, row = self.xy.astype(np.int64).T
-        keep = counted[row, column]
-        return self.texel[keep], _bilinear(image, counted, self.xy[keep])
-
-
-def faced_texels(view: CropView, body: Body, texels: Texels) -> FacedTexels:
-    """`ihbench.scene.visibility`'s rules for what is the nearest surface, at the crop's size."""
-    vertices = body.pose(view.body_pose)
-    nearest, *_ = surface_texels(vertices, body, texels, _train_view(view))
-    corners = vertices[body.faces[texels.face[nearest]]]
-    points = np.einsum("nk,nkd->nd", texels.bary[nearest], corners)
-    return FacedTexels(np.flatnonzero(nearest).astype(np.int32), view.camera.project(points)[:, :2])
+def counted_colours(
+    faced: FacedTexels,
+    image: NDArray[np.uint8],  # [S, W, 3]
+    counted: NDArray[np.bool_],  # [S, W]
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Texels [m] whose pixel counts, ascending, and their RGB [m, 3] in 0..255: bilinear over counted pixels."""
+    keep = counted[faced.pixel]
+    return faced.texel[keep], _bilinear(image, counted, faced.xy[keep])
 
 
 def pixel_texels(view: CropView, body: Body, texels: Texels) -> NDArray[np.int32]:
@@ -73,12 +54,6 @@ def _number_map(body: Body, resolution: int) -> NDArray[np.int32]:
     out[texels.index] = np.arange(len(texels.index))
     nearest = np.asarray(distance_transform_edt(~texels.mask, return_distances=False, return_indices=True))
     return out.reshape(resolution, resolution)[tuple(nearest)]
-
-
-def _train_view(view: CropView) -> TrainView:
-    mask = np.where(view.person, MaskState.PERSON, MaskState.BACKGROUND).astype(np.uint8)
-    mask[view.unknown] = MaskState.UNKNOWN
-    return TrainView(view.image, mask, view.camera, view.body_pose, view.index, "")
 
 
 def _bilinear(

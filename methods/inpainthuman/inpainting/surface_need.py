@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, median_filter
 
 from ihbench.body import Body
-from ihbench.body.uv import Texels, texel_table
+from ihbench.body.uv import Texels
 from ihbench.camera import Camera
 from ihbench.render.zbuffer import rasterize
-from ihbench.scene.contracts import MaskState, TrainingSet
-from ihbench.scene.visibility import surface_texels
+from ihbench.scene.contracts import TrainingSet
+from ihbench.scene.sightings import COARSE
 
 BAND = 0.05  # of the body's height in the image: garments and hair reach no farther off the body
 ENOUGH = 3  # views that should paint a texel
@@ -55,19 +55,12 @@ class SeenSurface:
         return flat.reshape(size, size)[tuple(np.asarray(nearest))]
 
 
-def seen_surface(training: TrainingSet, resolution: int, facing: float = 0.0) -> SeenSurface:
-    """Look through all training views. A texel faces a view well if the cosine between its normal and the direction
-    to the camera is at least `facing`."""
-    body = training.body
-    texels = texel_table(body, resolution)
-    count = np.zeros(len(texels.face), np.int32)
-    faced = []
-    for view in training.views:
-        nearest, row, column, cosine = surface_texels(body.pose(view.body_pose), body, texels, view)
-        state = view.mask[row, column]
-        count += nearest & (state == MaskState.PERSON)
-        faced.append(np.flatnonzero(nearest & (cosine >= facing) & (state == MaskState.UNKNOWN)))
-    return SeenSurface(texels, count, tuple(faced))
+def seen_surface(training: TrainingSet, facing: float = 0.0) -> SeenSurface:
+    """Of all training views. A texel faces a view well if the cosine between its normal and the direction to the
+    camera is at least `facing`."""
+    seen = training.sightings[COARSE]
+    faced = (texel[cosine >= facing] for texel, cosine in seen.hidden)
+    return SeenSurface(seen.texels, seen.visibility.seen, tuple(faced))
 
 
 def pixels_of(

@@ -15,9 +15,10 @@ from ihbench.clock.progress import Progress
 from ihbench.diffusion.crops.crop_view import CropView
 from ihbench.diffusion.crops.part_map import NO_PART, smpl_parts
 from ihbench.methods.inpainthuman.inpainting.colour_fills import mean_person, on_background
-from ihbench.methods.inpainthuman.inpainting.surface_colours import faced_texels, off_the_rim, pixel_texels
+from ihbench.methods.inpainthuman.inpainting.surface_colours import counted_colours, off_the_rim, pixel_texels
+from ihbench.scene.visibility import PosedSurface
 
-Seen = tuple[NDArray[np.int32], NDArray[np.uint8]]  # texels [n], RGB [n, 3]
+Seen = tuple[NDArray[np.int64], NDArray[np.uint8]]  # texels [n], RGB [n, 3]
 NEVER = -(2**40)  # index of a view that is farther away than any
 
 
@@ -115,7 +116,8 @@ def nearest_colours(
 
 
 def _seen(view: CropView, body: Body, texels: Texels) -> Seen:
-    texel, rgb = faced_texels(view, body, texels).colours(view.image, view.person & off_the_rim(view))
+    faced = PosedSurface(body, view.camera, view.body_pose).faced(texels)
+    texel, rgb = counted_colours(faced, view.image, view.person & off_the_rim(view))
     return texel, np.round(rgb).astype(np.uint8)
 
 

@@ -18,7 +18,6 @@ from ihbench.methods.inpainthuman.inpainting.surface_need import SeenSurface, ke
 from ihbench.scene.contracts import MaskState, TrainingSet, TrainView
 
 STATE = "stage2-painted"
-TEXELS = 128  # side of the UV grid on which the need is measured
 SIMPLE_SIZE = 128  # px, height of the crops of painters without a size of their own
 LEAST_PIXELS = 12  # of a view; fewer are not worth a painter
 
@@ -37,7 +36,7 @@ class Stage2:
         if saved is not None:
             return saved
         with self.ledger.stage("look"):
-            surface = seen_surface(self.training, TEXELS, self.config.facing)
+            surface = seen_surface(self.training, self.config.facing)
             shown = self._shown(surface)
         if not shown and not self.config.always:
             return self._nothing("no training view hides surface that needs a painter")

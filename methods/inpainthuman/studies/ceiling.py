@@ -27,7 +27,7 @@ from ihbench.methods.inpainthuman.stages.stage3 import Stage3
 from ihbench.metrics import mean_over_frames
 from ihbench.record.reopen import reopen_scene
 from ihbench.record.results import read_result
-from ihbench.scene.contracts import MaskState, TrainingSet, TrainView
+from ihbench.scene.contracts import MaskState, TrainView
 from ihbench.scene.views import OccludedScene, uncovered
 from ihbench.scoring.scoring import Scorer
 
@@ -62,21 +62,20 @@ def ceiling(
     scene, model = reopen_scene(folder, data, body)
     whole = uncovered(scene).train
     fitted = GaussianAvatar.load(folder / "avatar", model)
-    training = TrainingSet(scene.train, model, scene.protocol.image.background, scene.capture.name)
     seed = int(result.identity["seed"])
-    scorer = Scorer.build(scene, model)
+    scorer = Scorer.build(scene)
     rows = []
     with TemporaryDirectory() as copy:
         ledger = _lent(folder, Path(copy))
 
         def stage1() -> GaussianAvatar:
             avatar = GaussianAvatar(fitted.config, model, fitted.betas, seed).to(device)
-            Stage1(avatar, training, seed, ledger).run(Progress.silent())  # takes what is saved
+            Stage1(avatar, scene.training, seed, ledger).run(Progress.silent())  # takes what is saved
             return avatar
 
         avatar = stage1()
         rows.append(CeilingRow("stage 1 alone", None, math.nan, _scores(avatar, scorer, scene)))
-        painted = Stage2(avatar, training, fitted.config.inpaint, seed, ledger).run(Progress.silent())
+        painted = Stage2(avatar, scene.training, fitted.config.inpaint, seed, ledger).run(Progress.silent())
         taken = [view for view in painted if view.index < len(whole)]
         if not taken:
             raise BadInput(f"{folder}: painted no training view")
@@ -86,7 +85,7 @@ def ceiling(
         for share in shares:
             better = [with_truth(view, whole[view.index], share) for view in taken]
             avatar = stage1()
-            Stage3(avatar, training, [*better, *turntable], seed, Ledger()).run(progress)
+            Stage3(avatar, scene.training, [*better, *turntable], seed, Ledger()).run(progress)
             name = "true images" if share == 1 else f"{share:.0%} of the way to the true images"
             rows.append(CeilingRow(name, share, painted_psnr(better, whole), _scores(avatar, scorer, scene)))
     return rows

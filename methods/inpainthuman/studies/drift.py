@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from ihbench.body import Body
 from ihbench.body.uv import texel_table
 from ihbench.diffusion.crops.crop_view import CropView
-from ihbench.methods.inpainthuman.inpainting.surface_colours import faced_texels, off_the_rim
+from ihbench.methods.inpainthuman.inpainting.surface_colours import counted_colours, off_the_rim
 from ihbench.methods.inpainthuman.studies.patch_texture import lab, patch_count, patch_texture
 from ihbench.metrics.flip import flip
 from ihbench.metrics.psnr import decibels, psnr
 from ihbench.metrics.ssim import ssim
+from ihbench.scene.visibility import PosedSurface
 
 TEXELS = 128  # of the texture's side on which appearances are compared
 Image = NDArray[np.uint8]  # [S, W, 3]
@@ -156,9 +157,9 @@ def _sightings(
     table = texel_table(body, resolution)
     seen, painted = [], []
     for view, image in zip(views, completed, strict=True):
-        faced, inner = faced_texels(view, body, table), off_the_rim(view)
+        faced, inner = PosedSurface(body, view.camera, view.body_pose).faced(table), off_the_rim(view)
         for out, counted in ((seen, view.person & inner), (painted, view.unknown & inner)):
-            texel, rgb = faced.colours(image, counted)
+            texel, rgb = counted_colours(faced, image, counted)
             out.append((texel, rgb / 255))
     return seen, painted
 
