@@ -7,21 +7,18 @@ and checkpoint writing inside a fit are booked beside the fit, not in it. The fi
 
 from __future__ import annotations
 
-import json
 import re
 import time
-import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import TYPE_CHECKING, Any, TypedDict
 
 from ihbench.clock import interruption, machine
-from ihbench.files.atomic import decode, encode, write_bytes
-from ihbench.files.regular import read_bytes
+from ihbench.clock.checkpoints import States, Tensors, Words, state_file
+from ihbench.clock.events import Event, Happening, Warned
+from ihbench.files.atomic import encode, write_bytes
 
 if TYPE_CHECKING:
     from ihbench.clock.progress import Progress
@@ -30,11 +27,9 @@ FIT = "fit"
 EVALUATE = "evaluate"
 CHECKPOINT = "checkpoint"
 REDONE = "redone"  # fit time that a kill threw away
-CRC_BLANK = b'"payload_crc32":"00000000"'
 SAVE_SHARE = 0.05  # of the time may go into saving states
 STAGE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.+-]*(/[A-Za-z0-9][A-Za-z0-9 _.+-]*)*")
-LARGEST_HEADER = 2**26  # bytes of a saved state's header, events and all
-STATE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,99}")
+ARTIFACTS = {"inpainting.png": "painted training views"}  # files that methods leave beside the record -> their titles
 
 OnCheckpoint = Callable[[int, float, Any], None]
 
@@ -48,6 +43,28 @@ class Stage:
     peak_mb: float = 0.0  # the process's peak when the stage last ended
     peak_device_mb: float = 0.0
     entered: int = 0
+
+
+class StageRow(TypedDict):
+    """A stage as the record's table has it."""
+
+    stage: str  # path, or "other", or "total"
+    depth: int
+    share: float  # of the total
+    seconds: float
+    cpu_seconds: float
+    peak_mb: float
+    peak_device_mb: float
+    entered: int
+
+
+class Books(TypedDict):
+    """What `Ledger.state` gives and `Ledger(state=...)` takes: JSON-able."""
+
+    stages: Mapping[str, Mapping[str, float]]
+    seconds: float
+    cpu_seconds: float
+    events: Sequence[Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -81,31 +98,31 @@ class Ledger:
         folder: Path | None = None,
         *,
         device: str = "cpu",
-        state: Mapping[str, Any] | None = None,
+        state: Books | None = None,
         on_checkpoint: OnCheckpoint | None = None,
-        on_event: Callable[[str, Mapping[str, Any]], None] | None = None,  # kind and data of each, as it happens
+        on_event: Callable[[Event], None] | None = None,  # of each, as it happens
         quality_times: QualityTimes = QualityTimes(),
         save_every: float = 20.0,  # s, the least time between two saved states
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        self.folder = None if folder is None else Path(folder)
+        self._folder = None if folder is None else Path(folder)
+        self._states = States(self._folder)
         self.device = device
         self.on_checkpoint, self.on_event = on_checkpoint, on_event
         self.quality_times = quality_times
         self.save_every = save_every
-        self.events: list[dict[str, Any]] = []
+        self.events: list[Event] = []
         self._clock = clock
         self._stages: dict[str, Stage] = {}
         self._total = 0.0
         self._total_cpu = 0.0
         self._chain: tuple[str, ...] = ()  # open stages, outermost first
-        self._in_memory: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {}
         self._loaded_clock: float | None = None  # the latest fit clock among the states loaded
         self._offered_step: int | None = None
         if state is not None:
             self._stages = _stages(state["stages"])
             self._total, self._total_cpu = state["seconds"], state["cpu_seconds"]
-            self.events = list(state["events"])
+            self.events = [Event.of(row) for row in state["events"]]
         self._earlier = len(self.events)  # of these: what happened before this process
         self._last, self._last_cpu = clock(), time.process_time()
         self._last_save, self._save_cost = self._last, 0.0
@@ -224,67 +241,50 @@ class Ledger:
 
     def save_state(self, name: str, tensors: Mapping[str, Any], meta: Mapping[str, Any]) -> None:
         """Keep tensors (torch or numpy, any shape) and JSON-able `meta`, with the clock and the events so far, as
-        checkpoint `name`.
+        checkpoint `name`, replaced whole.
 
-        The file `checkpoints/<name>.safetensors` is replaced whole. The time is booked under `checkpoint`. Raises
-        `BadInput` when the disk is full, `ValueError` for a name that is no plain file name.
+        The time is booked under `checkpoint`. Raises `BadInput` when the disk is full, `ValueError` for a name that
+        is no plain file name.
         """
-        if not STATE_NAME.fullmatch(name):
-            raise ValueError(f"checkpoint name: expected letters, digits and _.+-, got {name!r}")
         start = self._clock()
         with self._charging((CHECKPOINT,)):
-            if self.folder is None:
-                self._in_memory[name] = _copies(tensors), {"meta": encode(dict(meta)), "clock": self._clocks()}
-            else:
-                events = {"name": name, "of": self.folder.name, "events": self.events}
-                data = _pack(tensors, {"meta": encode(dict(meta)), "clock": self._clocks(), **encode(events)})
-                write_bytes(self._state_path(name), data)
+            words = {"meta": dict(meta), "clock": self._clocks(), "events": self.events}
+            self._states.save(name, tensors, words)
         self._last_save = self._clock()
         self._save_cost = self._last_save - start
 
-    def load_state(self, name: str) -> tuple[dict[str, Any], dict[str, Any]] | None:
+    def load_state(self, name: str) -> tuple[Tensors, Words] | None:
         """Tensors (as they were: torch on the CPU, or numpy) and meta of checkpoint `name`, or None if there is none.
 
         The fit clock goes on from where it stood when the state was saved (the latest, when several are loaded): work
         that a kill threw away is booked under `redone`. Events that the kill took from the record come back, but not
-        from a state that another run has lent. A file that is truncated or damaged counts as absent, and an event
-        says so.
+        from a state that was reused from another run. A file that is truncated or damaged counts as absent, and an
+        event says so.
         """
-        if not STATE_NAME.fullmatch(name):
-            raise ValueError(f"checkpoint name: expected letters, digits and _.+-, got {name!r}")
+        state_file(Path(), name)  # a wrong name is an error, a damaged file is not
         with self._charging((CHECKPOINT,)):
-            if self.folder is None:
-                if name not in self._in_memory:
+            try:
+                saved = self._states.load(name)
+                if saved is None:
                     return None
-                tensors, record = self._in_memory[name]
-                tensors, clocks, meta = _copies(tensors), _stages(record["clock"]), decode(record["meta"])
-            else:
-                file = self._state_path(name)
-                if not file.exists():
-                    return None
-                try:
-                    tensors, record = _unpack(read_bytes(file))
-                    clocks, meta = _stages(record["clock"]), decode(record["meta"])
-                    events = list(decode(record["events"])) if record.get("of") == self.folder.name else []
-                except Exception as error:  # whatever a damaged file makes of the reader: the stage starts again
-                    self.event("warning", what=f"checkpoint {name} is damaged, starting that stage again: {error}")
-                    return None
-                self._recall(events)
+                tensors, words = saved
+                clocks, meta = _stages(words["clock"]), words["meta"]
+                events = [Event.of(row) for row in words.get("events", ())]
+            except Exception as error:  # whatever a damaged file makes of the reader: the stage starts again
+                self.event(Warned(f"checkpoint {name} is damaged, starting that stage again: {error}"))
+                return None
+            self._recall(events)
         self._go_on_from(clocks)
         return tensors, meta
 
-    def _recall(self, events: list[dict[str, Any]]) -> None:
+    def _recall(self, events: list[Event]) -> None:
         """Put events of an earlier process, as far as they are not known, before those of this one."""
         known = [encode(event) for event in self.events]  # encoded, NaN equals itself
         lost = [event for event in events if encode(event) not in known]
         self.events[self._earlier : self._earlier] = lost
         self._earlier += len(lost)
 
-    def _state_path(self, name: str) -> Path:
-        assert self.folder is not None
-        return self.folder / "checkpoints" / f"{name}.safetensors"
-
-    def _clocks(self) -> dict[str, Any]:
+    def _clocks(self) -> dict[str, dict[str, float]]:
         self._charge()
         return {path: asdict(stage) for path, stage in self._stages.items()}
 
@@ -313,22 +313,35 @@ class Ledger:
 
     # --- the record ---
 
-    def event(self, kind: str, **data: Any) -> None:
-        """Note something that happened: "warning", "diverged", "resumed", ..., with both clocks."""
-        self.events.append({"kind": kind, "fit_seconds": self.fit_seconds, "seconds": self.seconds, "data": data})
+    def event(self, happening: Happening) -> None:
+        """Note something that happened, with both clocks: see `ihbench.clock.events`."""
+        self.events.append(Event.at(happening, self.fit_seconds, self.seconds))
         if self.on_event is not None:
-            self.on_event(kind, data)
+            self.on_event(self.events[-1])
 
-    def state(self) -> dict[str, Any]:
+    @property
+    def on_disk(self) -> bool:
+        """Whether what is saved outlives the process."""
+        return self._folder is not None
+
+    def artifact(self, name: str, data: bytes) -> None:
+        """Leave a file beside the run's record, such as a picture; nothing where the ledger works in memory. Raises
+        `ValueError` for a name that is not among `ARTIFACTS`: whoever removes a run must know what belongs to it."""
+        if name not in ARTIFACTS:
+            raise ValueError(f"artifact: expected one of {', '.join(ARTIFACTS)}, got {name!r}")
+        if self._folder is not None:
+            write_bytes(self._folder / name, data)
+
+    def state(self) -> Books:
         """Everything but the checkpoints, as JSON-able data, for the run record and for `Ledger(state=...)`."""
         return {
             "stages": self._clocks(),
             "seconds": self._total,
             "cpu_seconds": self._total_cpu,
-            "events": list(self.events),
+            "events": [dict(vars(event)) for event in self.events],
         }
 
-    def table(self) -> list[dict[str, Any]]:
+    def table(self) -> list[StageRow]:
         """One row a stage, parents before children, then `other` and `total`.
 
         The rows of depth 0 above `total` add up to it. `share` is of the total; `peak_mb` is the process's peak when
@@ -347,9 +360,9 @@ class Ledger:
         return [*rows, _row("other", other, self._total), _row("total", total, self._total)]
 
 
-def _row(path: str, stage: Stage, total: float) -> dict[str, Any]:
+def _row(path: str, stage: Stage, total: float) -> StageRow:
     share = stage.seconds / total if total > 0 else 0.0
-    return {"stage": path, "depth": path.count("/"), "share": share, **asdict(stage)}
+    return StageRow(stage=path, depth=path.count("/"), share=share, **asdict(stage))
 
 
 def in_order(paths: Mapping[str, Any]) -> Iterator[str]:
@@ -376,74 +389,3 @@ def _stages(record: Mapping[str, Any]) -> dict[str, Stage]:
 
 def _root(path: str) -> str:
     return path.partition("/")[0]
-
-
-def saved_meta(file: Path) -> dict[str, Any]:
-    """The meta of a saved state's file. Raises `ValueError`, or what the reader raises, when it is damaged."""
-    return decode(_unpack(read_bytes(file))[1]["meta"])
-
-
-def is_saved_state(file: Path) -> bool:
-    """Whether `save_state` wrote this file, under this name: a copy under another name is somebody's own."""
-    try:
-        with open(file, "rb") as stream:
-            header = json.loads(stream.read(min(int.from_bytes(stream.read(8), "little"), LARGEST_HEADER)))
-        record = json.loads(header["__metadata__"]["record"])
-        return file.suffix == ".safetensors" and record.get("name", file.stem) == file.stem
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
-        return False
-
-
-def _copies(tensors: Mapping[str, Any]) -> dict[str, Any]:
-    """Own, contiguous copies on the CPU: what is written later cannot change, and no two share memory."""
-    out = {}
-    for name, value in tensors.items():
-        if hasattr(value, "detach"):
-            out[name] = value.detach().to("cpu", copy=True).contiguous()
-        elif isinstance(value, np.ndarray):
-            out[name] = np.array(value, order="C")
-        else:
-            raise TypeError(f"checkpoint {name}: expected a tensor or an array, got {type(value).__name__}")
-    return out
-
-
-def _pack(tensors: Mapping[str, Any], record: Mapping[str, Any]) -> bytes:
-    """A safetensors file with the record and a checksum of the payload in its metadata."""
-    values = _copies(tensors)
-    arrays = [name for name, value in values.items() if isinstance(value, np.ndarray)]
-    metadata = {"record": json.dumps({**record, "arrays": arrays}), "payload_crc32": "00000000"}
-    if len(arrays) == len(values):
-        from safetensors.numpy import save
-
-        data = save(values, metadata)
-    else:
-        import torch
-        from safetensors.torch import save as save_torch
-
-        named = {name: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for name, v in values.items()}
-        data = save_torch(named, metadata)
-    crc = zlib.crc32(memoryview(data)[_payload_start(data) :])
-    return data.replace(CRC_BLANK, CRC_BLANK.replace(b"00000000", b"%08x" % crc), 1)
-
-
-def _unpack(data: bytes) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The inverse of `_pack`. Raises `ValueError`, or what the reader raises, when the file is damaged."""
-    start = _payload_start(data)
-    metadata = json.loads(data[8:start])["__metadata__"]
-    if zlib.crc32(memoryview(data)[start:]) != int(metadata["payload_crc32"], 16):
-        raise ValueError("checksum differs")
-    record = json.loads(metadata["record"])
-    arrays = set(record["arrays"])
-    if len(arrays) == len(json.loads(data[8:start])) - 1:
-        from safetensors.numpy import load
-
-        return {name: np.array(value) for name, value in load(data).items()}, record
-    from safetensors.torch import load as load_torch
-
-    values = {name: value.clone() for name, value in load_torch(data).items()}
-    return {name: value.numpy() if name in arrays else value for name, value in values.items()}, record
-
-
-def _payload_start(data: bytes) -> int:
-    """Where the tensors begin: after 8 bytes of header length, little endian, and the header."""
-    return 8 + int.from_bytes(data[:8], "little")

@@ -68,5 +68,5 @@ class DiffusionInpainter:
             self.backbone, views, self.prompt, progress,
             seed=self.seed, steps=settled.sampler_steps, use_parts=self.config.sg, guidance=settled.guidance,
             noise_scale=settled.noise, batch=self.config.batch,
-            ledger=self.ledger if self.ledger.folder is not None else None,
+            ledger=self.ledger if self.ledger.on_disk else None,
         )  # fmt: skip

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ihbench.clock.events import Resumed, RolledBack, Warned
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.diffusion.backbone import Backbone, shrink_mask
@@ -184,7 +185,7 @@ class Personaliser:
                             f"{what}: one crop does not fit into memory; {ADVICE[self.backbone.name]}"
                         ) from error
                     batch = batch // 2
-                    self.ledger.event("warning", what=f"{what}: out of memory at step {step}, batch now {batch}")
+                    self.ledger.event(Warned(f"{what}: out of memory at step {step}, batch now {batch}"))
                     continue
                 if not fine:
                     why = f"{what}: loss {value}, gradient {norm} at step {step}"
@@ -245,9 +246,7 @@ class Personaliser:
         with torch.no_grad():
             for name, p in named.items():
                 p.copy_(values[name])
-        self.ledger.event(
-            "rolled_back", stage=state, step=step, what=f"{why}; went back to step {step} and stopped there"
-        )
+        self.ledger.event(RolledBack(state, step, f"{why}; went back to step {step} and stopped there"))
 
     # --- resume ---
 
@@ -282,7 +281,7 @@ class Personaliser:
                 if kept:
                     optimizer.state[p] = {k: v if k == "step" else v.to(p.device) for k, v in kept.items()}
         curve.steps[:], curve.losses[:] = list(meta["steps"]), list(meta["losses"])
-        self.ledger.event("resumed", stage=state, step=int(meta["step"]))
+        self.ledger.event(Resumed(state, int(meta["step"])))
         return int(meta["step"])
 
 

@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ihbench.clock.events import Resumed
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.diffusion.backbone import Backbone
@@ -130,5 +131,5 @@ def _restored(ledger: Ledger | None, out: list[NDArray[np.uint8]]) -> set[int]:
     tensors, meta = saved
     for k, image in tensors.items():
         out[int(k)] = np.asarray(image)
-    ledger.event("resumed", stage=STATE, step=meta["step"])
+    ledger.event(Resumed(STATE, meta["step"]))
     return {int(k) for k in tensors}

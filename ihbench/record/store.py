@@ -25,8 +25,9 @@ from pathlib import Path
 from typing import Any, get_args
 
 from ihbench.clock import machine
+from ihbench.clock.checkpoints import is_saved_state
 from ihbench.clock.interruption import undisturbed
-from ihbench.clock.ledger import Ledger, is_saved_state
+from ihbench.clock.ledger import ARTIFACTS, Ledger
 from ihbench.errors import BadInput
 from ihbench.files import atomic, locks, removal
 from ihbench.record.provenance import provenance
@@ -45,7 +46,7 @@ KILLED = "its process ended without a word: it was killed, or the machine went d
 WRITTEN = {
     "": {
         "run.json", "scores.jsonl", "calibration.jsonl", "curve.jsonl", "traceback.txt", "contact_sheet.png",
-        "inpainting.png", "avatar.ply",
+        "avatar.ply", *ARTIFACTS,
     },
     "avatar": {".safetensors", ".json", ".npz", ".npy", ".pt", ".pth", ".bin"},
     "checkpoints": {".safetensors"},

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ihbench.clock import machine
+from ihbench.clock.events import DivergedAt, Event, Resumed
 from ihbench.clock.failures import one_line
 from ihbench.clock.interruption import asked, interruptible, reason_of, undisturbed
 from ihbench.clock.ledger import Ledger, OnCheckpoint
@@ -56,7 +57,7 @@ class RecordedRun(ABC):
             outcome = asked() or error  # a library may have made something else of an interruption
             match outcome:
                 case Diverged():
-                    self.ledger.event("diverged", step=outcome.step, reason=outcome.reason)
+                    self.ledger.event(DivergedAt(outcome.step, outcome.reason))
                     self._end("diverged", str(outcome))
                 case BadInput():
                     self._end("failed", str(outcome))
@@ -81,10 +82,10 @@ class RecordedRun(ABC):
             except (BadInput, OSError) as error:  # the disk that failed the run may fail its record too
                 self.progress.say(f"the run's record could not be written: {error}")
 
-    def _say_where(self, kind: str, data: Mapping[str, Any]) -> None:
+    def _say_where(self, event: Event) -> None:
         """Where a run goes on that was cut short, or begins with what another one lent."""
-        if kind == "resumed":
-            self.progress.say(f"continuing {data.get('stage', 'the fit')} at step {data.get('step', 'unknown')}")
+        if event.kind == Resumed.kind:
+            self.progress.say(f"continuing {event.data['stage']} at step {event.data['step']}")
 
     def describe(self, **more: Any) -> None:
         """Put the clocks, the peak memory, what the machine has turned out to be, and more into the record."""

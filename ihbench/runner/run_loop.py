@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from ihbench import bounds, registry
 from ihbench.bounds import SEEDS
 from ihbench.clock import machine
+from ihbench.clock.events import Event, Reused
 from ihbench.clock.progress import Progress
 from ihbench.config_fields import flat, with_fields
 from ihbench.errors import BadInput
@@ -209,8 +210,9 @@ class _Run(RecordedRun):
         for state, free in method_spec(self.request.method).shared_states.items():
             other = lender(self.request.runs, self.folder, state, free, machine.identity())
             if other is not None:
-                self.ledger.events.extend(lend(other, self.folder, state))  # that it went back, say
-                self.ledger.event("shared", state=state, run=other.record["digest"])
+                went_back = lend(other, self.folder, state)  # or whatever else happened to it
+                self.ledger.events += [Event.of(row) for row in went_back]
+                self.ledger.event(Reused(state, other.record["digest"]))
 
     def _render(self, avatar: Avatar, view: TestView) -> NDArray[np.float32]:
         return avatar.render(view.camera, view.body_pose, self.request.protocol.image.background)[0]

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ihbench.clock.checkpoints import saved_meta, state_file
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.record.store import RunFolder
@@ -19,10 +20,10 @@ def lender(
     """A finished run under `runs` that has `state`, was made on such a machine as `here` with as many threads, and
     whose identity differs from the borrower's at most in configuration fields whose names begin with one of `free`;
     None when there is none, or nothing is missing."""
-    if _file(borrower.path, state).is_file():
+    if state_file(borrower.path, state).is_file():
         return None
     wanted = _key(borrower, free)
-    for file in sorted(_file(folder, state) for folder in Path(runs).glob("*/") if folder != borrower.path):
+    for file in sorted(state_file(folder, state) for folder in Path(runs).glob("*/") if folder != borrower.path):
         if file.is_file():
             try:
                 other = RunFolder.open(file.parent.parent)
@@ -37,8 +38,8 @@ def lender(
 
 def lend(other: RunFolder, borrower: RunFolder, state: str) -> list[dict[str, Any]]:
     """Copy the state, and the points of the quality-time curve up to it. Gives the ledger's events of that stage."""
-    target = _file(borrower.path, state)
-    atomic.write_bytes(target, _file(other.path, state).read_bytes())
+    target = state_file(borrower.path, state)
+    atomic.write_bytes(target, state_file(other.path, state).read_bytes())
     last = _last_step(target) or 0
     try:
         points = [point for point in other.curve() if point["step"] <= last]
@@ -51,16 +52,10 @@ def lend(other: RunFolder, borrower: RunFolder, state: str) -> list[dict[str, An
 
 def _last_step(file: Path) -> int | None:
     """The step that a saved state was taken at; None for a damaged file, which nobody should borrow."""
-    from ihbench.clock.ledger import saved_meta
-
     try:
         return int(saved_meta(file)["step"])
     except Exception:  # whatever a damaged file makes of the reader
         return None
-
-
-def _file(folder: Path, state: str) -> Path:
-    return folder / "checkpoints" / f"{state}.safetensors"
 
 
 def _key(run: RunFolder, free: Sequence[str]) -> dict[str, Any]:

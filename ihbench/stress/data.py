@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ihbench.body import texel_table
 from ihbench.camera import Camera
+from ihbench.clock.events import Warned
 from ihbench.clock.ledger import Ledger
 from ihbench.config_fields import replaced
 from ihbench.data.data_check import fitness
@@ -331,7 +332,7 @@ def _damaged_state(cut: int) -> Answer:
         path = Path(folder) / "checkpoints" / "stage.safetensors"
         path.write_bytes(path.read_bytes()[:-cut])
         lost = ledger.load_state("stage") is None
-        said = [event["data"]["what"] for event in ledger.events if event["kind"] == "warning"]
+        said = [event.data["what"] for event in ledger.events if event.kind == Warned.kind]
     return Answer(f"lost {lost}: {said}", "lost True: ['checkpoint stage is damaged")
 
 

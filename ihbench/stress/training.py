@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from ihbench.clock.events import RolledBack
 from ihbench.clock.ledger import Ledger
 from ihbench.errors import Diverged
 from ihbench.stress.case import Answer, Case
@@ -22,7 +23,7 @@ def told(fit: Callable[[], Any], ledger: Ledger) -> tuple[Any, str]:
         fitted, end = fit(), ""
     except Diverged as outcome:
         fitted, end = None, f"diverged, first bad step {outcome.step}: {outcome.reason}"
-    back = [_went_back(event["data"]) for event in ledger.events if event["kind"] == "rolled_back"]
+    back = [_went_back(event.data) for event in ledger.events if event.kind == RolledBack.kind]
     story = "; ".join(back) if back else "" if end else "no step rejected"
     return fitted, "; ".join(part for part in (story, end) if part)
 

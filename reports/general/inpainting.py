@@ -6,11 +6,11 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, TypedDict
 
+from ihbench.clock.events import Inpainted
 from ihbench.document.document import Block, Heading, Paragraph, Table, Words, bullets
 from ihbench.record.results import RunResult
 from ihbench.record.shape import Within, fault
 
-EVENT = "inpainted"
 Measured = Annotated[float, Within(nan=True, infinite=True)] | None
 
 
@@ -75,7 +75,8 @@ def inpainting_section(labelled: Mapping[str, Sequence[RunResult]]) -> list[Bloc
 
 def _painted(run: RunResult) -> list[dict[str, Any]]:
     events = (run.record.get("ledger") or {}).get("events", [])
-    return [event["data"] for event in events if event["kind"] == EVENT][-1:]  # the last, if a run was resumed
+    painted = [event["data"] for event in events if event["kind"] == Inpainted.kind]
+    return painted[-1:]  # the last, if a run was resumed
 
 
 def _mean(rows: Sequence[Mapping[str, Any]], name: str) -> float:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from ihbench.clock.ledger import ARTIFACTS
 from ihbench.record.results import RunResult
 from ihbench.record.row_labels import by_label
 
-PICTURES = {"contact_sheet.png": "test views", "inpainting.png": "painted training views"}
+PICTURES = {"contact_sheet.png": "test views", **ARTIFACTS}
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 LARGEST_FILE = 16 * 2**20  # bytes; a page of pictures must still open
 LARGEST_PAGE = 48 * 2**20  # bytes of all pictures

@@ -12,6 +12,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ihbench.clock.events import DivergedAt, Inpainted, Reused, Warned
 from ihbench.clock.ledger import Ledger, QualityTimes
 
 
@@ -301,7 +302,7 @@ def test_saving_is_booked_apart_and_throttled():
 def test_slow_saves_are_made_rarer(monkeypatch):
     clock = Clock()
     ledger = Ledger(clock=clock, save_every=20)
-    monkeypatch.setattr("ihbench.clock.ledger._copies", lambda tensors: clock.sleep(10) or {})
+    monkeypatch.setattr("ihbench.clock.checkpoints._copies", lambda tensors: clock.sleep(10) or {})
     ledger.save_state("s", {}, {})
     clock.sleep(199)
     assert not ledger.due_to_save()
@@ -391,7 +392,7 @@ def test_damage_anywhere_counts_as_absent_and_is_said(tmp_path, numpy_only):
         file.write_bytes(data)
         assert ledger.load_state("s") is None
         assert len(ledger.events) == count
-        assert ledger.events[-1]["kind"] == "warning"
+        assert ledger.events[-1].kind == "warning"
     file.write_bytes(good)
     assert ledger.load_state("s") is not None
 
@@ -415,36 +416,36 @@ def test_events_carry_both_clocks_and_survive_a_resume():
     clock.sleep(1)
     with ledger.stage("fit"):
         clock.sleep(2)
-        ledger.event("diverged", step=9, reason="loss is NaN")
+        ledger.event(DivergedAt(9, "loss is NaN"))
     expected = {"kind": "diverged", "fit_seconds": 2, "seconds": 3, "data": {"step": 9, "reason": "loss is NaN"}}
-    assert ledger.events == [expected]
-    assert Ledger(state=ledger.state()).events == [expected]
+    assert ledger.state()["events"] == [expected]
+    assert Ledger(state=ledger.state()).events == ledger.events
 
 
 def test_events_that_a_kill_took_from_the_record_come_back_with_the_state(tmp_path):
     before = Ledger(tmp_path)
-    before.event("warning", what="told before the fit")
+    before.event(Warned("told before the fit"))
     recorded = before.state()  # what run.json has
-    before.event("inpainted", drift=math.nan)
+    before.event(Inpainted(1, 2, 3, {"delta_e": math.nan}, {}))
     before.save_state("painted", {"a": np.zeros(1)}, {})
-    before.event("warning", what="never saved")
+    before.event(Warned("never saved"))
 
     again = Ledger(tmp_path, state=recorded)
-    again.event("shared", state="stage1")
+    again.event(Reused("stage1", "0123456789"))
     for _ in range(2):  # once is enough
         again.load_state("painted")
-    assert [event["kind"] for event in again.events] == ["warning", "inpainted", "shared"]
-    assert math.isnan(again.events[1]["data"]["drift"])
+    assert [event.kind for event in again.events] == ["warning", "inpainted", "shared"]
+    assert math.isnan(again.events[1].data["identity_drift"]["delta_e"])
     again.save_state("refined", {"a": np.zeros(1)}, {})
     third = Ledger(tmp_path, state=recorded)
     third.load_state("painted")
     third.load_state("refined")
-    assert [event["kind"] for event in third.events] == ["warning", "inpainted", "shared"]
+    assert [event.kind for event in third.events] == ["warning", "inpainted", "shared"]
 
 
 def test_a_lent_state_brings_no_events_of_its_lender(tmp_path):
     lender = Ledger(tmp_path / "lender")
-    lender.event("warning", what="of the lender")
+    lender.event(Warned("of the lender"))
     lender.save_state("stage1", {"a": np.zeros(1)}, {})
     (tmp_path / "borrower").mkdir()
     (tmp_path / "lender" / "checkpoints").rename(tmp_path / "borrower" / "checkpoints")

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from ihbench.clock.events import RolledBack, Warned
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.commands import ablate as ablate_command
@@ -265,10 +266,10 @@ def test_what_happened_in_a_lent_stage_is_told_of_the_borrower_too(tmp_path):
     """And nothing that happened later in the lender."""
     lender, borrower = tmp_path / "lender", tmp_path / "borrower"
     ledger = Ledger(lender)
-    ledger.event("rolled_back", stage="stage1", step=25, bad_step=30)
+    ledger.event(RolledBack("stage1", 25, "…", 30))
     ledger.save_state("stage1", {"x": np.zeros(3)}, {"step": 600})
-    ledger.event("rolled_back", stage="stage3", step=650, bad_step=651)
-    ledger.event("warning", what="it rains")
+    ledger.event(RolledBack("stage3", 650, "…", 651))
+    ledger.event(Warned("it rains"))
     record = {"ledger": ledger.state()}
     points = [{"step": 300}, {"step": 600}, {"step": 700}]
     other = SimpleNamespace(path=lender, record=record, curve=lambda: points)

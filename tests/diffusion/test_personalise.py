@@ -212,9 +212,9 @@ class TestTrouble:
             person, "_roll_back", lambda named, good, *a: (kept.append(good), roll_back(named, good, *a))
         )
         person.run(QUIET)
-        (event,) = [event for event in ledger.events if event["kind"] == "rolled_back"]
-        assert event["data"]["step"] == 20
-        assert "loss nan" in event["data"]["what"]
+        (event,) = [event for event in ledger.events if event.kind == "rolled_back"]
+        assert event.data["step"] == 20
+        assert "loss nan" in event.data["what"]
         now = dict(backbone.unet.named_parameters())
         assert all(
             torch.equal(now[name.removeprefix("unet.")], v) for name, v in kept[0][1].items() if "unet." in name
@@ -241,8 +241,8 @@ class TestTrouble:
         monkeypatch.setattr(person, "loss", loss)
         monkeypatch.setattr(torch.optim.AdamW, "step", step)
         person.run(QUIET)
-        (event,) = [event for event in ledger.events if event["kind"] == "rolled_back"]
-        assert event["data"]["step"] == (0 if spoiled == 20 else 20)
+        (event,) = [event for event in ledger.events if event.kind == "rolled_back"]
+        assert event.data["step"] == (0 if spoiled == 20 else 20)
         assert all(torch.isfinite(value).all() for value in weights(backbone.unet).values())
         assert all(torch.isfinite(value).all() for value in weights(backbone.controlnet).values())
 
@@ -295,7 +295,7 @@ class TestTrouble:
         monkeypatch.setattr(person, "loss", loss)
         limit = 1
         person.run(QUIET)
-        warnings = [event["data"]["what"] for event in ledger.events if event["kind"] == "warning"]
+        warnings = [event.data["what"] for event in ledger.events if event.kind == "warning"]
         assert [w.split()[-1] for w in warnings] == ["2", "1"]
         limit = 0
         other = Personaliser(tiny_backbone(), crops(HIDE), replace(TINY, ti=False, batch=4), 0, Ledger())

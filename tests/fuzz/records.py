@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ihbench.cli import main
+from ihbench.clock.events import Inpainted, Resumed
 from ihbench.clock.ledger import Ledger
 from ihbench.errors import BadInput
 from ihbench.files import atomic
@@ -187,8 +188,8 @@ def make_run(
         pass
     painted = {"views": 3, "of": 4, "pixels": 100, "flicker": {"deviation": 0.1, "deviation_floor": 0.05}}
     drift = {"delta_e": 3.0, "delta_e_floor": 1.0, "texture": 0.2, "texture_floor": float("nan")}
-    ledger.event("inpainted", **painted, identity_drift=drift)
-    ledger.event("resumed", stage="stage1", step=4)
+    ledger.event(Inpainted(**painted, identity_drift=drift))
+    ledger.event(Resumed("stage1", 4))
     run.record["machine"] |= {"load_average": [0.5, 0.5], "load_average_end": [0.7, 0.5]}
     rows = {row: [_line(row, frame) for frame in (0, 1)] for row in (method, f"{method} [novel]", "truth")}
     rows["truth [novel]"] = [_line("truth [novel]", frame) for frame in (0, 1)]

@@ -49,7 +49,7 @@ def a_stage(training, ledger=None, spoiled_calls=(), **changes):
 
 
 def events(ledger, kind="rolled_back"):
-    return [event["data"] for event in ledger.events if event["kind"] == kind]
+    return [event.data for event in ledger.events if event.kind == kind]
 
 
 def test_a_fit_in_which_nothing_is_wrong_is_the_fit_without_a_guard(training, monkeypatch):

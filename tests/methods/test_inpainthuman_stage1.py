@@ -306,9 +306,7 @@ def test_a_resumed_fit_equals_an_uninterrupted_one_to_the_bit(views, saved, kill
     resumed = fitted(training, ledger=ledger)
     assert equal_bits(parameters_of(whole), parameters_of(resumed))
     assert resumed.residual_on == whole.residual_on
-    assert [event["data"] for event in ledger.events if event["kind"] == "resumed"] == [
-        {"stage": "stage1", "step": saved}
-    ]
+    assert [event.data for event in ledger.events if event.kind == "resumed"] == [{"stage": "stage1", "step": saved}]
 
 
 def test_killed_twice_and_on_disk(views, tmp_path):

@@ -204,7 +204,7 @@ class TestStage2:
         monkeypatch.setattr(Stage2, "_painter", None)
         ledger = Ledger()
         assert Stage2(an_avatar(), one_sided(hidden=None), SIMPLE, 0, ledger).run(QUIET) == []
-        assert [event["data"]["what"] for event in ledger.events] == ["inpainting"]
+        assert [event.data["what"] for event in ledger.events] == ["inpainting"]
 
     def test_context_frame_asks_for_every_hidden_pixel(self):
         training = training_set()
@@ -246,15 +246,15 @@ class TestStage2:
         config = replace(SIMPLE, context="frame")
         monkeypatch.setattr(Stage2, "_shown", lambda self, surface: {0: one_sided(far).views[0]})
         assert Stage2(an_avatar(), one_sided(far), config, 0, ledger).run(QUIET) == []
-        assert [event["kind"] for event in ledger.events] == ["left_out"]
+        assert [event.kind for event in ledger.events] == ["left_out"]
 
     def test_what_is_claimed_is_in_the_record(self):
         ledger = Ledger()
         Stage2(an_avatar(), one_sided(), SIMPLE, 0, ledger).run(QUIET)
-        (event,) = [event for event in ledger.events if event["kind"] == "inpainted"]
-        assert event["data"]["views"] == 3
-        assert event["data"]["pixels"] > 0
-        assert {"identity_drift", "flicker"} <= set(event["data"])
+        (event,) = [event for event in ledger.events if event.kind == "inpainted"]
+        assert event.data["views"] == 3
+        assert event.data["pixels"] > 0
+        assert {"identity_drift", "flicker"} <= set(event.data)
         assert {"look", "inpaint", "silhouette", "measure"} <= set(ledger.state()["stages"])
 
     def test_turntable_views_follow_the_training_views(self):

@@ -410,10 +410,10 @@ def test_without_lpips_weights_the_term_is_off_and_said_so(views, painted, monke
     for _ in range(2):  # the second finds the first one's work, and has nothing new to say
         wanted = refined(training, painted, ledger=ledger, config=replace(config, lpips=0.1))
         assert equal_bits(parameters_of(without), parameters_of(wanted))
-    (event,) = (event for event in ledger.events if event["kind"] != "resumed")
-    assert event["kind"] == "left_out"
-    assert event["data"]["what"] == "lpips term"
-    assert "vgg16-397923af.pth" in event["data"]["reason"]
+    (event,) = (event for event in ledger.events if event.kind != "resumed")
+    assert event.kind == "left_out"
+    assert event.data["what"] == "lpips term"
+    assert "vgg16-397923af.pth" in event.data["reason"]
 
 
 @pytest.mark.parametrize("change", [{"lpips": 0.0}, {"weight": 0.0}])
@@ -491,9 +491,7 @@ def test_a_resumed_refinement_equals_an_uninterrupted_one_to_the_bit(views, pain
     killed_after(an_avatar(), training, painted, ledger, killed)
     resumed = refined(training, painted, ledger=ledger)
     assert equal_bits(parameters_of(whole), parameters_of(resumed))
-    assert [event["data"] for event in ledger.events if event["kind"] == "resumed"] == [
-        {"stage": "stage3", "step": saved}
-    ]
+    assert [event.data for event in ledger.events if event.kind == "resumed"] == [{"stage": "stage3", "step": saved}]
 
 
 def test_killed_on_disk_behind_a_finished_stage_one(views, painted, tmp_path):

@@ -78,9 +78,9 @@ def test_all_three_stages_are_in_the_ledger_and_repeat_bit_for_bit(mini):
     stages = set(ledger.state()["stages"])
     inside = ("look", "load", "textual-inversion", "adapt", "inpaint", "silhouette", "measure")
     assert {f"fit/stage2/{name}" for name in inside} | {"fit/stage3"} <= stages
-    kinds = [event["kind"] for event in ledger.events]
+    kinds = [event.kind for event in ledger.events]
     assert "inpainted" in kinds
-    curves = {event["data"]["stage"] for event in ledger.events if event["kind"] == "loss_curve"}
+    curves = {event.data["stage"] for event in ledger.events if event.kind == "loss_curve"}
     assert curves == {TI_STATE, ADAPT_STATE}
     assert equal_bits(parameters_of(first), parameters_of(fit(config(mini))))
     assert not equal_bits(parameters_of(first), parameters_of(fit(config(mini), seed=1)))
@@ -206,9 +206,9 @@ def test_killed_in_any_stage_and_resumed_ends_the_same(tmp_path, mini, state, mo
     again = Ledger(tmp_path)
     resumed = fit(given, again)
     assert equal_bits(parameters_of(resumed), parameters_of(whole))
-    assert state in [event["data"]["stage"] for event in again.events if event["kind"] == "resumed"]
-    assert sum(event["kind"] == "inpainted" for event in again.events) == 1  # nothing that was measured is lost
-    curves = [event["data"]["stage"] for event in again.events if event["kind"] == "loss_curve"]
+    assert state in [event.data["stage"] for event in again.events if event.kind == "resumed"]
+    assert sum(event.kind == "inpainted" for event in again.events) == 1  # nothing that was measured is lost
+    curves = [event.data["stage"] for event in again.events if event.kind == "loss_curve"]
     assert sorted(curves) == sorted([TI_STATE, ADAPT_STATE])
 
 
@@ -217,10 +217,10 @@ def test_the_miniature_of_stable_diffusion_2_goes_the_whole_way(tmp_path):
     given = config(tmp_path, backbone="sd2", token="<someone>")
     ledger = Ledger()
     avatar = fit(given, ledger)
-    (event,) = [event for event in ledger.events if event["kind"] == "inpainted"]
-    assert event["data"]["pixels"] > 0
+    (event,) = [event for event in ledger.events if event.kind == "inpainted"]
+    assert event.data["pixels"] > 0
     assert np.isfinite(avatar.render(a_camera(0.0, SIZE), a_pose(0.0, 0.0))[0]).all()
-    curve = next(e["data"] for e in ledger.events if e["kind"] == "loss_curve" and e["data"]["stage"] == ADAPT_STATE)
+    curve = next(e.data for e in ledger.events if e.kind == "loss_curve" and e.data["stage"] == ADAPT_STATE)
     assert np.isfinite(curve["losses"]).all()
     assert given.inpaint.settled().vectors == 1
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from ihbench.cli import main
+from ihbench.clock.events import RolledBack
 from ihbench.clock.ledger import Ledger
 from ihbench.errors import BadInput, Diverged
 from ihbench.metrics import ssim as ssim_function
@@ -221,7 +222,7 @@ def test_flips_are_pairs_whose_order_is_reversed():
 def test_the_story_of_a_fit():
     ledger = Ledger()
     assert told(lambda: 7, ledger) == (7, "no step rejected")
-    ledger.event("rolled_back", stage="s", step=0, bad_step=9, what="…")
+    ledger.event(RolledBack("s", 0, "…", 9))
 
     def diverges():
         raise Diverged(12, "loss is nan")

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ihbench.clock.events import Resumed, RolledBack
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput, Diverged
@@ -231,7 +232,7 @@ class Optimisation(ABC):
         self.rolled_back += 1
         step, share = self.first_step + good.step, SMALLER**self.rolled_back
         what = f"{bad.reason} at step {bad.step}; went back to step {step}, step sizes × {share:g} from there"
-        self.ledger.event("rolled_back", stage=self.name, step=step, bad_step=bad.step, what=what)
+        self.ledger.event(RolledBack(self.name, step, what, bad.step))
 
     # --- resume ---
 
@@ -282,4 +283,4 @@ class Optimisation(ABC):
             device = self.avatar.device
             self._good = _Good(meta["good"], {n: torch.as_tensor(v).to(device) for n, v in named.items()})
         self._restored()
-        self.ledger.event("resumed", stage=self.name, step=self.step)
+        self.ledger.event(Resumed(self.name, self.step))

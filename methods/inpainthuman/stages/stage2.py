@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ihbench.clock.events import Inpainted, LeftOut, LossCurve, Resumed
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.diffusion.crops.crop_view import CropView, Inpainter, cut_view, with_frames
@@ -68,14 +70,14 @@ class Stage2:
         ]
         if self.config.filler == "diffusion":
             for state, curve in painter.curves.items():
-                self.ledger.event("loss_curve", stage=state, steps=curve.steps[::5], losses=curve.losses[::5])
+                self.ledger.event(LossCurve(state, curve.steps[::5], curve.losses[::5]))
         with self.ledger.stage("measure"):
             self._record(crops, filmed, painted, silhouettes)
         self._save(out)
         return out
 
     def _nothing(self, reason: str) -> list[PaintedView]:
-        self.ledger.event("left_out", what="inpainting", reason=reason)
+        self.ledger.event(LeftOut("inpainting", reason))
         self._save([])
         return []
 
@@ -140,18 +142,18 @@ class Stage2:
         # a turntable view follows no other in time
         in_time = [k for k, view in enumerate(views) if view.index < frames]
         self.ledger.event(
-            "inpainted",
-            views=len(views),
-            of=frames,
-            pixels=int(sum(view.unknown.sum() for view in views)),
-            identity_drift=identity_drift(filmed, images, body),
-            flicker=flicker([filmed[k] for k in in_time], [painted[k] for k in in_time], body),
+            Inpainted(
+                views=len(views),
+                of=frames,
+                pixels=int(sum(view.unknown.sum() for view in views)),
+                identity_drift=asdict(identity_drift(filmed, images, body)),
+                flicker=asdict(flicker([filmed[k] for k in in_time], [painted[k] for k in in_time], body)),
+            )
         )
-        if self.ledger.folder is not None:
-            from ihbench.files.atomic import write_bytes
+        if self.ledger.on_disk:
             from ihbench.methods.inpainthuman.studies.grid import painted_grid, png
 
-            write_bytes(self.ledger.folder / "inpainting.png", png(painted_grid(views, painted, silhouettes)))
+            self.ledger.artifact("inpainting.png", png(painted_grid(views, painted, silhouettes)))
 
     # --- resume ---
 
@@ -183,5 +185,5 @@ class Stage2:
             pose = BodyPose(part["pose"], part["betas"], part["transl"])
             view = TrainView(part["image"], part["mask"], camera, pose, int(frame), str(camera_id))
             out.append(PaintedView(int(index), view, part["generated"].astype(bool)))
-        self.ledger.event("resumed", stage=STATE, step=len(out))
+        self.ledger.event(Resumed(STATE, len(out)))
         return out

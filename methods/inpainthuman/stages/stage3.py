@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
+from ihbench.clock.events import LeftOut
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
@@ -98,9 +99,9 @@ class Stage3(Optimisation):
 
     def _say_once(self, what: str, reason: str) -> None:
         """A resumed run has the event already."""
-        said = [event["data"].get("what") for event in self.ledger.events if event["kind"] == "left_out"]
+        said = [event.data["what"] for event in self.ledger.events if event.kind == LeftOut.kind]
         if what not in said:
-            self.ledger.event("left_out", what=what, reason=reason)
+            self.ledger.event(LeftOut(what, reason))
 
     def _loss(self, k: int) -> Tensor:
         target, background = self._targets[k], self.training.background

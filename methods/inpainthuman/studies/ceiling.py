@@ -15,6 +15,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from ihbench.clock.checkpoints import state_file
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
@@ -56,7 +57,7 @@ def ceiling(
     result = read_result(folder)
     if result.method != "inpainthuman" or result.status != "done":
         raise BadInput(f"{folder}: is a run of {result.method}, {result.status}; expected one of inpainthuman, done")
-    missing = [state for state in STATES if not _state(folder, state).is_file()]
+    missing = [state for state in STATES if not state_file(folder, state).is_file()]
     if missing:
         raise BadInput(f"{folder}: has no saved state {missing[0]}; only runs that paint have a ceiling of painting")
     scene, model = reopen_scene(folder, data, body)
@@ -114,15 +115,11 @@ def painted_psnr(painted: Sequence[PaintedView], whole: Sequence[TrainView]) -> 
     return math.inf if squares == 0 else 10 * math.log10(255**2 * count / squares)
 
 
-def _state(folder: Path, name: str) -> Path:
-    return folder / "checkpoints" / f"{name}.safetensors"
-
-
 def _lent(folder: Path, copy: Path) -> Ledger:
     """A ledger with copies of the run's states: what is done with it leaves the run as it is."""
     (copy / "checkpoints").mkdir()
     for state in STATES:
-        shutil.copyfile(_state(folder, state), _state(copy, state))
+        shutil.copyfile(state_file(folder, state), state_file(copy, state))
     return Ledger(copy)
 
 
