@@ -215,7 +215,9 @@ class _Run(RecordedRun):
                 self.ledger.event(Reused(state, other.record["digest"]))
 
     def _render(self, avatar: Avatar, view: TestView) -> NDArray[np.float32]:
-        return avatar.render(view.camera, view.body_pose, self.request.protocol.image.background)[0]
+        background, frames = self.request.protocol.image.background, self.occluded.hiding.frames
+        frame = view.frame if view.frame in frames else None  # whose pose it has: the capture has one a frame
+        return avatar.render(view.camera, view.body_pose, background, frame)[0]
 
     def _curve_point(self, step: int, seconds: float, avatar: Avatar) -> None:
         """Score a checkpoint on a few fixed test views. The fit clock stands still meanwhile."""

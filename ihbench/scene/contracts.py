@@ -37,7 +37,8 @@ class TrainView:
 
 @dataclass(frozen=True)
 class TestView:
-    """One test image with its truth. Methods never see it; only camera and body pose reach `Avatar.render`."""
+    """One test image with its truth. Methods never see it; camera, body pose and the number of a frame that was
+    trained on reach `Avatar.render`, nothing else."""
 
     __test__ = False  # pytest: not a test class
 
@@ -134,16 +135,31 @@ class Avatar(Protocol):
     """A fitted person that can be drawn in any pose from any camera."""
 
     def render(
-        self, camera: Camera, body_pose: BodyPose, background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+        self,
+        camera: Camera,
+        body_pose: BodyPose,
+        background: tuple[float, float, float] = (1.0, 1.0, 1.0),  # RGB in [0, 1]
+        frame: int | None = None,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """rgb [H, W, 3] in [0, 1] composited on `background`, and alpha [H, W] in [0, 1]."""
+        """rgb [H, W, 3] in [0, 1] composited on `background`, and alpha [H, W] in [0, 1].
+
+        `frame` is the number of the training frame whose pose this is (`TrainView.frame`), for methods that learn
+        something for each frame; None for every other pose.
+        """
         ...
 
     def save(self, folder: Path) -> None: ...
 
 
 class Method(Protocol):
-    """A system under test. `config` is a frozen dataclass; its fields become `--method.*` switches."""
+    """A system under test, registered by a `scene.method_spec.MethodSpec`. `config` is a frozen dataclass; its fields
+    become `--method.*` switches.
+
+    A method sees no folder. `ledger` is all it has of the run: `ledger.stage(name)` times, `ledger.offer(step,
+    avatar)` draws quality against time, `ledger.save_state` and `ledger.load_state` let a killed run go on,
+    `ledger.event` notes what happened (`clock.events`), `ledger.artifact` leaves a picture. `fit` raises
+    `Diverged(step, reason)` where the loss stops being finite.
+    """
 
     config: Any
 

@@ -195,6 +195,16 @@ def test_every_seed_is_a_run_of_its_own(bench, mannequin):
     assert "| mannequin | 1 | 0, 1 |" in outcome.out
 
 
+def test_a_method_is_told_the_frame_of_a_pose_that_it_was_trained_on(bench, mannequin, monkeypatch):
+    assert bench("list", "methods").status == 0  # imports it
+    from own_method.method import MannequinAvatar
+
+    told, render = set(), MannequinAvatar.render
+    monkeypatch.setattr(MannequinAvatar, "render", lambda *words: told.add(words[-1]) or render(*words))
+    assert bench.run("--test-frames", "0:75:50", method=mannequin).status == 0
+    assert told == {0, None}
+
+
 def test_calibration_is_computed_once_for_all_methods_and_seeds(bench_with_run, mannequin, monkeypatch):
     assert bench_with_run.run(method=mannequin).status == 0
     monkeypatch.setattr(Calibration, "build", lambda *_: pytest.fail("computed again"))

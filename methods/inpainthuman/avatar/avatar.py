@@ -181,7 +181,11 @@ class GaussianAvatar(nn.Module):
         return self.pose_points(points, offset, self.transforms(body_pose)), scale, color
 
     def render(
-        self, camera: Camera, body_pose: BodyPose, background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+        self,
+        camera: Camera,
+        body_pose: BodyPose,
+        background: tuple[float, float, float] = (1.0, 1.0, 1.0),
+        frame: int | None = None,  # nothing is learned for single frames
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """rgb [H, W, 3] on `background` and alpha [H, W]; see `scene.contracts.Avatar`.
 
