@@ -1,260 +1,233 @@
 r"""LaTeX tables read into grids, without TeX.
 
-Understood: tabular, tabular*, tabularx, tabulary, longtable, tabu, tblr and NiceTabular; \multicolumn, \multirow;
-rules of all packages; comments; the file's own macros; and in cells what `latex_cells.py` understands. Files that are
-included are not followed.
+Understood: tabular, tabular* and tabularx; \multicolumn, \multirow and the rules of booktabs; comments; macros that
+\newcommand defines in the same file; and in cells bold, underline, footnotes, spreads and the usual signs. A command
+that is not known is read as if it were not there, its braces as text, and noted. Files that are included are not
+followed.
 """
 
 from __future__ import annotations
 
 import re
 from bisect import bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from ihbench.reports.lint.latex_cells import LONGEST, Macros, after_optional, closing, show
-from ihbench.reports.lint.table_reading import PAIRED, Grid, GridRow, ReadCell, Styled, blanked, read_cell
+from ihbench.reports.lint.table_reading import PAIRED, Grid, GridRow, ReadCell, Styled, read_cell
 
-TABULARS = (
-    "tabular", "tabular*", "tabularx", "tabulary", "longtable", "xltabular", "supertabular", "tabu", "longtabu",
-    "tblr", "longtblr", "talltblr", "NiceTabular", "NiceTabular*", "NiceTabularX",
-)  # fmt: skip
-WITH_WIDTH = ("tabular*", "tabularx", "tabulary", "xltabular", "NiceTabular*", "NiceTabularX")  # {width}{columns}
-FLOATS = ("table", "wraptable", "sidewaystable", "figure", "minipage")
-EDGE = re.compile(r"\\(begin|end)\s*\{(" + "|".join(map(re.escape, TABULARS)) + r")\}")
-ENVIRONMENT = re.compile(r"\\(begin|end)\s*\{")
-ROW_END = re.compile(r"(?:\\\\\*?|\\tabularnewline\b|\\cr\b)(?:\s*\[[-+.\w\s\\]*\])?")
-COMMENT = re.compile(r"(?<!\\)((?:\\\\)*)%[^\n]*")
-HIDDEN = (
-    *((rf"\begin{{{name}}}", rf"\end{{{name}}}") for name in ("comment", "verbatim", "lstlisting")),
-    (r"\iffalse", r"\fi"),
+BUDGET = 1000  # groups and macros of a cell: one macro can call itself twice
+DEEPEST = 60
+TABULAR = re.compile(r"\\begin\{(tabular[*x]?)\}(.*?)(\\end\{\1\}|\Z)", re.DOTALL)
+COMMENT = re.compile(r"(?<!\\)((?:\\\\)*)%[^\n]*|\\begin\{comment\}.*?\\end\{comment\}|\\iffalse.*?\\fi", re.DOTALL)
+GROUP = r"\{((?:[^{}\\]|\\.|\{(?:[^{}\\]|\\.|\{[^{}]*\})*\})*)\}"  # braces, three deep
+MACRO = re.compile(r"\\(?:re)?newcommand\*?\s*\{?\\([A-Za-z]+)\}?\s*(?:\[(\d)\])?\s*" + GROUP)
+FULL_RULE = re.compile(r"\s*\\(?:hline|toprule|midrule|bottomrule)\b\s*(?:\[[^\]]*\])?")
+BETWEEN = re.compile(
+    r"\s*\\(?:c(?:mid)?rule|cline|addlinespace|rowcolor|noalign|vspace)\*?(?:\[[^\]]*\]|\([^)]*\)|\{[^{}]*\})*"
 )
-DEFINITION = re.compile(
-    r"\\(?:(?:re)?newcommand|providecommand|DeclareRobustCommand)\*?\s*\{?\s*\\([A-Za-z]+)\s*\}?\s*(?:\[(\d)\])?"
-    r"(?:\[[^\]]*\])?\s*(?=\{)|\\def\s*\\([A-Za-z]+)\s*((?:#\d)*)\s*(?=\{)"
-)
-CAPTION = re.compile(r"\\caption(?:of)?\*?(?:\s*\{(?:table|figure)\})?(?:\s*\[[^\]]*\])?\s*(?=\{)")
-INPUT = re.compile(r"\\(?:input|include)\s*\{[^}]*\}")
-FULL_RULES = (
-    "hline",
-    "Hline",
-    "toprule",
-    "midrule",
-    "bottomrule",
-    "specialrule",
-    "Xhline",
-    "hdashline",
-    "thickhline",
-)
-# what may stand between two rows: how many arguments it has beside optional ones
-BETWEEN = {
-    **dict.fromkeys(FULL_RULES, 0),
+SPAN = re.compile(r"\\(multicolumn|multirow)\*?\s*(?:\[[^\]]*\])?\s*\{\s*-?(\d{1,2})\s*\}")
+TOKEN = re.compile(r"\\([A-Za-z]+)\*?\s?|\\(.)|(.)", re.DOTALL)
+ARGUMENT = re.compile(r"\s*(?:\[[^\]]*\])?\s*(?:" + GROUP + r"|(\\[A-Za-z]+|\\?.))", re.DOTALL)
+
+MARKS = {
+    **dict.fromkeys(("textbf", "mathbf", "bm", "boldsymbol", "bf", "bfseries", "best", "first"), "best"),
+    **dict.fromkeys(("underline", "uline", "ul", "second", "secondbest"), "second"),
+}
+DECLARATIONS = ("bf", "bfseries")  # up to the end of the group
+# commands that show all of what follows, or whose last argument is shown: how many stand before it
+SHOWN = {
     **dict.fromkeys(
-        ("addlinespace", "morecmidrules", "endhead", "endfirsthead", "endfoot", "endlastfoot", "smallskip", "medskip",
-         "bigskip", "pagebreak", "nopagebreak"), 0,
+        ("textrm", "textsf", "texttt", "textsc", "textit", "emph", "mathit", "mathrm", "text", "mbox", "makecell",
+         "num", "ensuremath", "operatorname", "tiny", "scriptsize", "footnotesize", "small", "normalsize",
+         "centering", "it", "itshape", "left", "right", "hfill", "displaystyle", "protect"), 0,
     ),
-    **dict.fromkeys(
-        ("Xhline", "cline", "cmidrule", "cdashline", "cdashlinelr", "hhline", "noalign", "arrayrulecolor", "rowcolor",
-         "vspace", "SetRow", "caption", "label"), 1,
-    ),
-    **dict.fromkeys(("Xcline", "setlength", "rule"), 2),
-    **dict.fromkeys(("specialrule", "rowcolors"), 3),
+    "textcolor": 1, "color": 1, "href": 1, "scalebox": 1, "raisebox": 1,
+    "multirow": 2, "multicolumn": 2, "resizebox": 2,
 }  # fmt: skip
+DROPPED = (
+    "cite", "citep", "citet", "ref", "cref", "label", "footnote", "textsuperscript", "tnote", "phantom", "hphantom",
+    "vphantom", "cellcolor", "rowcolor", "hspace", "vspace",
+)  # fmt: skip
+SIGNS = {
+    "uparrow": "↑", "downarrow": "↓", "pm": "±", "times": "×", "cdot": "·", "sim": "~", "approx": "≈", "infty": "∞",
+    "le": "≤", "leq": "≤", "ge": "≥", "geq": "≥", "dagger": "†", "ddagger": "‡", "ast": "*", "checkmark": "✓",
+    "beta": "β", "bullet": "•", "textdagger": "†", "textdaggerdbl": "‡", "textdegree": "°", "textquotedbl": '"',
+    "textasciigrave": "`", "surd": "✓", "textperiodcentered": "·", "textmu": "µ", "degree": "°", "circ": "°",
+    "rightarrow": "→", "textendash": "–", "textemdash": "—", "ldots": "…", "dots": "…", "quad": " ", "qquad": " ",
+    "textbackslash": "\\", "textless": "<", "textgreater": ">", "textbar": "|", "textasciitilde": "~",
+    "textasciicircum": "^", "Delta": "Δ", "delta": "δ", "mu": "μ", "sigma": "σ", "lambda": "λ", "alpha": "α",
+    "S": "§",
+}  # fmt: skip
+SPACING = {**dict.fromkeys(",;: \n\\", " "), **dict.fromkeys("!/-()[]@", "")}  # after a backslash
+FOOTNOTE = re.compile(r"[*†‡§¶∗°\s\d]*|[a-z](\s*,\s*[a-z])*")  # a superscript that says nothing of the number
+SPREAD = re.compile(r"[±+\-−]\s*[\d.]")
 
+Macros = dict[str, tuple[int, str]]  # name -> number of arguments, body
 Notes = list[tuple[int, str]]  # line, text
 
 
 def latex_grids(text: str) -> tuple[list[Grid], Notes]:
     """The tables of a LaTeX file in order, and notes on what was not understood."""
-    paired = [found.start() for found in re.finditer(rf"%\s*{PAIRED}\b", text)]
-    code = text
-    for opening, ending in HIDDEN:
-        code = blanked(code, opening, ending)
-    code = COMMENT.sub(_spaces, code)
-    macros, code = _macros(code)
-    reader = _Reader(code, [0, *(found.end() for found in re.finditer("\n", text))], macros)
-    grids, before = [], 0
-    for begin, inner, end in reader.tabulars():
-        rows = reader.rows(inner, end)
-        if rows:
-            told = any(before <= place < end for place in paired)
-            grids.append(Grid(reader.line(begin), tuple(rows), _caption(code, begin, end), told))
-        before = end
-    reader.notes += [(reader.line(found.start()), f"{found[0]} not followed") for found in INPUT.finditer(code)]
-    return grids, list(dict.fromkeys(reader.notes))
-
-
-def _spaces(found: re.Match[str]) -> str:
-    """As many spaces, so that everything else stays where it is."""
-    return re.sub(r"[^\n]", " ", found[0])
-
-
-def _macros(code: str) -> tuple[Macros, str]:
-    """The file's own macros, and the file without their definitions."""
-    macros: Macros = {}
-    parts, at, kept = [], 0, 0
-    while (found := DEFINITION.search(code, at)) is not None:
-        at = found.end()
-        end = closing(code, at)
-        if end is None:
-            break
-        count = int(found[2] or 0) if found[1] else len(found[4] or "") // 2
-        macros[found[1] or found[3]] = count, code[at + 1 : end]
-        at = end + 1
-        parts += [code[kept : found.start()], re.sub(r"[^\n]", " ", code[found.start() : at])]
-        kept = at
-    return macros, "".join([*parts, code[kept:]])
-
-
-def _caption(code: str, begin: int, end: int) -> str:
-    """The caption of the float around a table, without commands."""
-    opened = max(code.rfind(rf"\begin{{{name}", 0, begin) for name in FLOATS)
-    if opened < 0 or any(code.find(rf"\end{{{name}", opened, begin) >= 0 for name in FLOATS):
-        return ""
-    closed = min((at for name in FLOATS if (at := code.find(rf"\end{{{name}", end)) >= 0), default=len(code))
-    found = CAPTION.search(code, opened, closed)
-    close = None if found is None else closing(code, found.end())
-    if found is None or close is None:
-        return ""
-    return " ".join(re.sub(r"\\[A-Za-z]+\*?|[{}~]", " ", code[found.end() : close]).split())
+    paired = [match.start() for match in re.finditer(rf"%\s*{PAIRED}\b", text)]
+    code = COMMENT.sub(lambda match: re.sub(r"[^\n]", " ", match[0]), text)
+    macros = {match[1]: (int(match[2] or 0), match[3]) for match in MACRO.finditer(code)}
+    code = MACRO.sub(lambda match: re.sub(r"[^\n]", " ", match[0]), code)
+    starts = [0, *(match.end() for match in re.finditer("\n", text))]
+    grids, notes, before = [], [], 0
+    for match in TABULAR.finditer(code):
+        reader = _Rows(code, starts, macros, notes)
+        line = bisect_right(starts, match.start())
+        if not match[3]:
+            notes.append((line, rf"\begin{{{match[1]}}} without \end{{{match[1]}}}"))
+        inner = match.start(2)
+        for _ in range(1 if match[1] == "tabular" else 2):  # width, columns
+            if (
+                argument := re.compile(r"\s*(?:\[[^\]]*\]\s*)?" + GROUP).match(code, inner, match.end(2))
+            ) is not None:
+                inner = argument.end()
+        rows = reader.rows(inner, match.end(2))
+        if any(len(row.cells) > 1 for row in rows):
+            grids.append(Grid(line, tuple(rows), any(before <= place < match.start() for place in paired)))
+        before = match.end()
+    for match in re.finditer(r"\\(?:input|include)\s*\{[^}]*\}", code):
+        notes.append((bisect_right(starts, match.start()), f"{match[0]} not followed"))
+    return grids, list(dict.fromkeys(notes))
 
 
 @dataclass
-class _Reader:
+class _Rows:
     code: str
-    starts: Sequence[int]  # of the file's lines
+    starts: list[int]  # of the file's lines
     macros: Macros
-    notes: Notes = field(default_factory=list)
-
-    def line(self, at: int) -> int:
-        return bisect_right(self.starts, at)
-
-    def tabulars(self) -> Iterator[tuple[int, int, int]]:
-        """(begin, begin of the rows, end of the rows) of tables, of nested ones too, if they have cells."""
-        opened: list[tuple[str, int, int]] = []
-        found: list[tuple[str, int, int, int]] = []  # name, begin, behind the name, end
-        for edge in EDGE.finditer(self.code):
-            if edge[1] == "begin":
-                opened.append((edge[2], edge.start(), edge.end()))
-            elif any(name == edge[2] for name, _, _ in opened):
-                while (last := opened.pop())[0] != edge[2]:
-                    found.append((*last, edge.start()))
-                    self._unclosed(*last[:2])
-                found.append((*last, edge.start()))
-        for last in opened:
-            found.append((*last, len(self.code)))
-            self._unclosed(*last[:2])
-        for name, begin, after, end in sorted(found, key=lambda table: table[1]):
-            inner = self._after_arguments(name, after, end)
-            if re.compile(r"(?<!\\)&").search(self.code, inner, end):
-                yield begin, inner, end
-
-    def _unclosed(self, name: str, begin: int) -> None:
-        self.notes.append((self.line(begin), rf"\begin{{{name}}} without \end{{{name}}}"))
-
-    def _after_arguments(self, name: str, at: int, end: int) -> int:
-        """Behind the arguments of an environment: [position], {width}, {columns}."""
-        braces = 2 if name in WITH_WIDTH else 1
-        spread = re.compile(r"\s*(?:to|spread)\s*[^\s{]+").match(self.code, at)
-        if name in ("tabu", "longtabu") and spread is not None:
-            at = spread.end()
-        while True:
-            while at < end and self.code[at].isspace():
-                at += 1
-            behind = after_optional(self.code, at)
-            if behind == at and braces and self.code[at : at + 1] == "{":
-                close = closing(self.code, at)
-                behind, braces = (at if close is None else close + 1), braces - 1
-            if behind == at:
-                return min(at, end)
-            at = behind
+    notes: Notes
 
     def rows(self, begin: int, end: int) -> list[GridRow]:
         rows: list[GridRow] = []
         reaching: dict[int, tuple[int, ReadCell]] = {}  # column -> rows that a \multirow still covers, its cell
         pending = False  # a rule that stands alone belongs to the next row
-        for row_begin, row_end in self._pieces(begin, end, rows=True):
-            at, ruled = self._between(row_begin, row_end)
-            pending |= ruled
-            if not self.code[at:row_end].strip():
+        for row in self._pieces(begin, end, re.compile(r"\\\\\*?(?:\s*\[[^\]]*\])?|\\tabularnewline\b")):
+            at, stop = row
+            while (rule := FULL_RULE.match(self.code, at, stop) or BETWEEN.match(self.code, at, stop)) is not None:
+                pending |= FULL_RULE.match(rule[0]) is not None
+                at = rule.end()
+            if not self.code[at:stop].strip():
                 continue
             cells: list[ReadCell] = []
-            for cell_begin, cell_end in self._pieces(at, row_end, rows=False):
+            for cell_begin, cell_end in self._pieces(at, stop, re.compile("&")):
                 cell, across, down = self._cell(cell_begin, cell_end)
-                column = len(cells)
-                left, above = reaching.pop(column, (0, cell))
+                left, above = reaching.pop(len(cells), (0, cell))
                 if left > 0 and not cell.text:
-                    reaching[column] = left - 1, above
+                    reaching[len(cells)] = left - 1, above
                     cell = cell if above.number else above
                 elif down > 1:
-                    reaching[column] = down - 1, cell
+                    reaching[len(cells)] = down - 1, cell
                 cells += [cell] * across
-            rows.append(GridRow(tuple(cells), self.line(at), pending))
+            at += len(self.code[at:stop]) - len(self.code[at:stop].lstrip())
+            rows.append(GridRow(tuple(cells), bisect_right(self.starts, at), pending))
             pending = False
         return rows
 
-    def _pieces(self, begin: int, end: int, rows: bool) -> Iterator[tuple[int, int]]:
-        r"""What lies between \\ (rows) or & (cells), outside groups and inner environments."""
-        code, depth, inner, start, k = self.code, 0, 0, begin, begin
+    def _pieces(self, begin: int, end: int, border: re.Pattern[str]) -> Iterator[tuple[int, int]]:
+        """What lies between borders outside groups."""
+        depth, start, k = 0, begin, begin
         while k < end:
-            c = code[k]
-            if c == "\\":
-                if (edge := ENVIRONMENT.match(code, k)) is not None:
-                    inner += 1 if edge[1] == "begin" else -1
-                    k = edge.end() - 1
-                elif rows and depth <= 0 and inner <= 0 and (found := ROW_END.match(code, k, end)) is not None:
-                    yield start, k
-                    start = k = found.end()
-                else:
-                    k += 2
-                continue
-            depth += (c == "{") - (c == "}")
-            if c == "&" and not rows and depth <= 0 and inner <= 0:
+            if depth <= 0 and (match := border.match(self.code, k, end)) is not None:
                 yield start, k
-                start = k + 1
-            k += 1
+                start = k = match.end()
+                continue
+            c = self.code[k]
+            depth += (c == "{") - (c == "}")
+            k += 2 if c == "\\" else 1
         yield start, end
-
-    def _between(self, at: int, end: int) -> tuple[int, bool]:
-        """Behind the rules at the start of a row, and whether one of them goes all the way across."""
-        code, ruled = self.code, False
-        while True:
-            while at < end and code[at].isspace():
-                at += 1
-            found = re.compile(r"\\([A-Za-z]+)\*?").match(code, at, end)
-            if found is None or found[1] not in BETWEEN:
-                return at, ruled
-            ruled |= found[1] in FULL_RULES
-            at, arguments = found.end(), BETWEEN[found[1]]
-            while at < end:
-                optional = re.compile(r"\s*(?:\[[^\]]*\]|\([^)]*\))").match(code, at, end)
-                brace = re.compile(r"\s*\{").match(code, at, end) if arguments else None
-                if optional is not None:
-                    at = optional.end()
-                elif brace is not None and (close := closing(code, brace.end() - 1)) is not None:
-                    at, arguments = close + 1, arguments - 1
-                else:
-                    break
 
     def _cell(self, begin: int, end: int) -> tuple[ReadCell, int, int]:
         """A cell, how many columns it spans, and how many rows."""
-        source = self.code[begin : min(end, begin + LONGEST)]
-        line = self.line(begin + len(source) - len(source.lstrip()))
-        if end - begin > LONGEST:
-            self.notes.append((line, "a cell is too long: the rest of it is left out"))
-        across, down = (_spanned(source, name) for name in ("multicolumn", "multirow"))
-        if re.search(r"\\SetCell\s*\[[^\]]*\b[cr]\s*=", source):
-            self.notes.append((line, r"\SetCell over several cells: only the first is read"))
-        shown = show(source, self.macros)
-        self.notes += [(line, note) for note in shown.notes]
-        return read_cell(_trimmed(shown.styled), line, shown.colours), across, down
+        source = self.code[begin:end]
+        line = bisect_right(self.starts, begin + len(source) - len(source.lstrip()))
+        spans = {match[1]: max(1, int(match[2])) for match in SPAN.finditer(source)}
+        shown, notes = show(source, self.macros)
+        self.notes += [(line, note) for note in notes]
+        text = "".join(character for character, _ in shown)
+        trimmed = shown[len(text) - len(text.lstrip()) : len(text.rstrip())]
+        return read_cell(trimmed, line), spans.get("multicolumn", 1), spans.get("multirow", 1)
 
 
-def _spanned(source: str, name: str) -> int:
-    found = re.search(rf"\\{name}\*?\s*(?:\[[^\]]*\])?\s*\{{\s*-?(\d{{1,3}})\s*\}}", source)
-    return max(1, min(int(found[1]), 200)) if found else 1
+def show(source: str, macros: Macros | None = None) -> tuple[Styled, list[str]]:
+    """The characters that a piece of code shows, with their marks, and what was not understood."""
+    shown = _Shown(macros or {})
+    shown.add(source, "", 0)
+    return shown.styled, list(dict.fromkeys(shown.notes))
 
 
-def _trimmed(styled: Styled) -> Styled:
-    text = "".join(character for character, _ in styled)
-    return styled[len(text) - len(text.lstrip()) : len(text.rstrip())]
+@dataclass
+class _Shown:
+    macros: Macros
+    styled: Styled = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    left: int = BUDGET
+
+    def add(self, source: str, mark: str, depth: int) -> None:
+        """Append what the source shows, marked."""
+        self.left -= 1
+        if depth > DEEPEST or self.left < 0:
+            self.notes.append("nested too deeply, or too long: the rest of the cell is left out")
+            return
+        at = 0
+        while (token := TOKEN.match(source, at)) is not None:
+            name, escaped, character = token.groups()
+            at = token.end()
+            if name is not None:
+                at, mark = self._command(name, source, at, mark, depth)
+            elif escaped is not None:
+                self._put(SPACING.get(escaped, escaped), mark)
+            elif character == "{" and (group := re.compile(GROUP).match(source, at - 1)) is not None:
+                self.add(group[1], mark, depth + 1)
+                at = group.end()
+            elif character in "^_":
+                at = self._script(source, at, mark, depth)
+            elif character not in "{}$":
+                self._put(" " if character in "~\n\t" else character, mark)
+
+    def _put(self, text: str, mark: str) -> None:
+        self.styled += [(character, mark) for character in text]
+
+    def _command(self, name: str, source: str, at: int, mark: str, depth: int) -> tuple[int, str]:
+        """Show a command; behind it, and the mark from there on."""
+        own = mark if mark == "best" else MARKS.get(name, mark)
+        if name in DECLARATIONS:
+            return at, own
+        if name in MARKS:
+            at, inside = _argument(source, at)
+            self.add(inside, own, depth + 1)
+        elif name in self.macros:
+            count, body = self.macros[name]
+            for k in range(count):
+                at, inside = _argument(source, at)
+                body = body.replace(f"#{k + 1}", inside)[:BUDGET]
+            self.add(body, mark, depth + 1)
+        elif name in SIGNS:
+            self._put(SIGNS[name], mark)
+        elif name in DROPPED or name in SHOWN:
+            for _ in range(SHOWN.get(name, 1)):
+                at, _ = _argument(source, at)
+        else:
+            self.notes.append(f"\\{name} is not known: its braces are read as text")
+        return at, mark
+
+    def _script(self, source: str, at: int, mark: str, depth: int) -> int:
+        """A superscript or subscript: shown if it is a spread, left out if it is a footnote's sign."""
+        at, inside = _argument(source, at)
+        place = len(self.styled)
+        self.add(inside, mark, depth + 1)
+        text = "".join(character for character, _ in self.styled[place:]).strip()
+        if SPREAD.match(text):
+            self.styled.insert(place, (" ", mark))
+        elif FOOTNOTE.fullmatch(text):
+            del self.styled[place:]
+        return at
+
+
+def _argument(source: str, at: int) -> tuple[int, str]:
+    """Behind the next argument, and the argument: a group, a command or a character. Optional ones are skipped."""
+    match = ARGUMENT.match(source, at)
+    return (len(source), "") if match is None else (match.end(), match[1] if match[2] is None else match[2])

@@ -26,37 +26,29 @@ class LintOptions:
 
 def main(argv: list[str]) -> int:
     """Print one line for each finding; status 1 if there are any. What was not understood goes to stderr."""
-    chosen = options(LintOptions, argv, "report lint", SUMMARY)
+    given = options(LintOptions, argv, "report lint", SUMMARY)
     from ihbench.reports.lint.table_files import read_tables
     from ihbench.reports.lint.table_lint import lint, unknown_heads
 
-    if not chosen.file:
+    if not given.file:
         raise BadInput("report lint: which file? give one or more .tex or .md files")
-    readings = {file: read_tables(file) for file in chosen.file}  # all of them, before anything is said
+    readings = {file: read_tables(file) for file in given.file}  # all of them, before anything is said
     tables = sum(len(reading.tables) for reading in readings.values())
-    found = {file: lint(reading.tables) for file, reading in readings.items()}
+    findings = {file: lint(reading.tables) for file, reading in readings.items()}
     for file, reading in readings.items():
-        told: set[str] = set()
-        notes = list(reading.notes)
-        for table in reading.tables:
-            notes += [
-                (
-                    head.cell.line,
-                    f"column {head.title or 'without a head'} has marks, but neither a known metric nor an arrow",
-                )
-                for head in unknown_heads(table)
-            ]
-        for line, text in sorted(notes):
-            if text not in told:
-                print(f"ihbench: {file}:{line}: note: {text}", file=sys.stderr)
-            told.add(text)
-    if chosen.json:
-        rows = [{"file": str(file), **asdict(finding)} for file, findings in found.items() for finding in findings]
+        first = {text: line for line, text in sorted(reading.notes, reverse=True)}  # said once, where it is met first
+        for head in (head for table in reading.tables for head in unknown_heads(table)):
+            what = f"column {head.title or 'without a head'} has marks, but neither a known metric nor an arrow"
+            first.setdefault(what, head.cell.line)
+        for text, line in sorted(first.items(), key=lambda note: note[::-1]):
+            print(f"ihbench: {file}:{line}: note: {text}", file=sys.stderr)
+    if given.json:
+        rows = [{"file": str(file), **asdict(finding)} for file, of_file in findings.items() for finding in of_file]
         print(json.dumps({"status": "found" if rows else "clean", "tables": tables, "findings": rows}))
     else:
-        for file, findings in found.items():
-            for finding in findings:
+        for file, of_file in findings.items():
+            for finding in of_file:
                 print(f"{file}:{finding}")
-        if not any(found.values()):
+        if not any(findings.values()):
             print(f"nothing found in {tables} table{'' if tables == 1 else 's'}")
-    return 1 if any(found.values()) else 0
+    return 1 if any(findings.values()) else 0

@@ -18,19 +18,9 @@ COST = {
     "fps": True, "time": False, "latency": False, "runtime": False, "seconds": False, "memory": False,
     "params": False, "parameters": False, "flops": False, "gflops": False, "storage": False,
 }  # fmt: skip
-BOUNDED = {
-    "ssim",
-    "ms-ssim",
-    "lpips",
-    "dssim",
-    "dists",
-    "flip",
-    "iou",
-    "miou",
-    "accuracy",
-    "precision",
-    "recall",
-}  # by 1
+BOUNDED = {  # by 1
+    "ssim", "ms-ssim", "lpips", "dssim", "dists", "flip", "iou", "miou", "accuracy", "precision", "recall",
+}  # fmt: skip
 NAMES = sorted((*QUALITY, *COST), key=len, reverse=True)
 NAME = re.compile(rf"(?<![A-Za-z-])({'|'.join(map(re.escape, NAMES))})(?![A-Za-z])", re.IGNORECASE)
 ARROW = re.compile("[↑↓⬆⬇⇑⇓]")

@@ -6,7 +6,6 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from enum import IntFlag
 
 from ihbench.reports.lint.metric_names import HeadMetric, head_metric
 
@@ -21,23 +20,10 @@ CELL = re.compile(
     \s*(?P<unit2>{UNITS})?\s*(?:\([-+−↑↓][^)]*\))?\s*[†‡§¶*∗⋆]*\s*""",
     re.VERBOSE,
 )  # fmt: skip
-NOTHING = re.compile(r"\s*(?:[-–—]+|n/?a|N/?A|/|✗|×|\?)?\s*")  # a cell without a number
 UNRANKED = re.compile(r"(gt|ground[- ]?truth|oracle|upper[- ]?bound)\b", re.IGNORECASE)
 PAIRED = "ihbench lint: paired"  # a comment before a table: its marks come from paired differences
-COLOURS = "red|orange|yellow|green|blue|cyan|teal|purple|magenta|gold|silver|bronze|pink|gray|grey"
 
-
-class Style(IntFlag):
-    """Of one character."""
-
-    PLAIN = 0
-    BEST = 1
-    SECOND = 2
-    THIRD = 4
-    ITALIC = 8
-
-
-Styled = list[tuple[str, Style]]  # characters with their styles
+Styled = list[tuple[str, str]]  # characters with the mark that they carry: "best", "second" or ""
 
 
 @dataclass(frozen=True)
@@ -62,13 +48,7 @@ class ReadCell:
     text: str
     line: int
     number: Number | None = None
-    mark: str = ""  # best, second, third
-    italic: bool = False
-    colours: tuple[str, ...] = ()
-
-    @property
-    def empty(self) -> bool:
-        return NOTHING.fullmatch(self.text) is not None
+    mark: str = ""  # best, second
 
 
 @dataclass(frozen=True)
@@ -84,7 +64,6 @@ class Grid:
 
     line: int
     rows: tuple[GridRow, ...]
-    caption: str = ""
     paired: bool = False
     heads: int = 0  # rows that the syntax makes heads
 
@@ -128,32 +107,16 @@ class Reading:
     notes: list[tuple[int, str]] = field(default_factory=list)  # line, what was not understood
 
 
-def blanked(text: str, opening: str, closing: str) -> str:
-    """The text with everything from each opening to its closing turned into spaces, so that lines and places stay."""
-    parts, at = [], 0
-    while (begin := text.find(opening, at)) >= 0 and (end := text.find(closing, begin + len(opening))) >= 0:
-        end += len(closing)
-        parts += [text[at:begin], re.sub(r"[^\n]", " ", text[begin:end])]
-        at = end
-    return "".join([*parts, text[at:]])
-
-
 # -------------------------------------------------------------------------------------------------------- cells
 
 
-def read_cell(styled: Styled, line: int, colours: Sequence[str] = ()) -> ReadCell:
+def read_cell(styled: Styled, line: int) -> ReadCell:
     """A cell from its characters: its number, and the mark on that number."""
-    text = "".join(character for character, _ in styled)
-    found = CELL.fullmatch(text)
-    if found is None:
-        return ReadCell(" ".join(text.split()), line, colours=tuple(colours))
-    style = styled[found.start("value")][1]
-    mark = next((word for bit, word in MARKS if style & bit), "")
-    number = _number(found)
-    return ReadCell(" ".join(text.split()), line, number, mark, bool(style & Style.ITALIC), tuple(colours))
-
-
-MARKS = ((Style.BEST, "best"), (Style.SECOND, "second"), (Style.THIRD, "third"))
+    written = "".join(character for character, _ in styled)
+    match, text = CELL.fullmatch(written), " ".join(written.split())
+    if match is None:
+        return ReadCell(text, line)
+    return ReadCell(text, line, _number(match), styled[match.start("value")][1])
 
 
 def _number(found: re.Match[str]) -> Number:
@@ -187,7 +150,7 @@ def _float(text: str) -> float:
 
 def tables_of(grid: Grid) -> list[ReadTable]:
     """The tables in a grid: a row of metric names after rows of numbers begins another one."""
-    rows = _marked_by_colour(grid)
+    rows = grid.rows
     width = max((len(row.cells) for row in rows), default=0)
     found: list[ReadTable] = []
     heads: list[GridRow] = []
@@ -252,8 +215,7 @@ def _table(grid: Grid, heads: list[GridRow], body: list[tuple[GridRow, int, int]
         )
         for name, (row, ruled, titled) in zip(names, body, strict=True)
     ]
-    table = ReadTable(grid.line, tuple(columns[labels:]), tuple(rows), grid.paired)
-    return [_upright(table)]
+    return [ReadTable(grid.line, tuple(columns[labels:]), tuple(rows), grid.paired)]
 
 
 def _names(rows: Sequence[GridRow], labels: int) -> list[str]:
@@ -283,50 +245,3 @@ def _head(heads: Sequence[GridRow], k: int, line: int) -> Head:
             arrow = metric.arrow or next((m.arrow for c in parts if (m := head_metric(c.text)) and m.arrow), "")
             return Head(cell, title, replace(metric, arrow=arrow))
     return Head(parts[-1] if parts else ReadCell("", line), title, None)
-
-
-def _upright(table: ReadTable) -> ReadTable:
-    """The table with metrics as columns: turned over if they are its rows."""
-    if any(head.metric for head in table.heads):
-        return table
-    metrics = [head_metric(row.label) for row in table.rows]
-    if not any(metrics):
-        return table
-    heads = tuple(
-        Head(ReadCell(row.label, row.line), row.label, metric)
-        for row, metric in zip(table.rows, metrics, strict=True)
-    )
-    rows = tuple(
-        ReadRow(head.title or f"column {k + 2}", tuple(row.cells[k] for row in table.rows), table.line)
-        for k, head in enumerate(table.heads)
-    )
-    return ReadTable(table.line, heads, rows, table.paired)
-
-
-# ----------------------------------------------------------------------------------------- marks by colour or slant
-
-
-def _marked_by_colour(grid: Grid) -> list[GridRow]:
-    """The rows with marks for colours and italics, where the caption or custom makes them marks.
-
-    A caption that says "best" and names colours gives their order. Without one, red, orange and yellow cells are the
-    first, second and third of many papers on radiance fields. Italics mark where the caption says so.
-    """
-    caption = grid.caption.lower()
-    named = list(dict.fromkeys(re.findall(rf"\b({COLOURS})\b", caption))) if "best" in caption else []
-    order = named or ["red", "orange", "yellow"]
-    slanted = "italic" in caption
-
-    def marked(cell: ReadCell) -> ReadCell:
-        if cell.number is None or cell.mark:
-            return cell
-        for colour in cell.colours:
-            kind, _, name = colour.partition(":")
-            if kind == "text" and not named:
-                continue  # coloured words are often just emphasis
-            for rank, wanted in enumerate(order[:3]):
-                if wanted in name or ("first", "second", "third")[rank] in name:
-                    return replace(cell, mark=("best", "second", "third")[rank])
-        return replace(cell, mark="second") if slanted and cell.italic else cell
-
-    return [replace(row, cells=tuple(marked(cell) for cell in row.cells)) for row in grid.rows]
