@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ihbench.camera import Camera
 from ihbench.datasets.standin.lighting import Lighting
+from ihbench.render.triangles import triangle_normals
 from ihbench.render.zbuffer import rasterize
 
 Array = NDArray[np.float64]
@@ -99,8 +100,7 @@ def furniture_view(
     height, width = camera.height, camera.width
     raster = rasterize(points, furniture.faces, height * s, width * s)
     corners = furniture.vertices[furniture.faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = triangle_normals(corners)
     outwards = (normals * (camera.center - corners.mean(1))).sum(1) > 0
     normals[~outwards] *= -1
     colours = np.clip(furniture.colours * lighting.shade(normals), 0, 1) * 255

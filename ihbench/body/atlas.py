@@ -13,6 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ihbench.render.triangles import triangle_areas
+
 Array = NDArray[np.float64]
 
 
@@ -114,8 +116,7 @@ def _unroll(
     angle = np.where(at_pole, face_angle[:, None], angle)  # at the tip of a part a vertex has no angle of its own
     key = np.column_stack([faces.ravel(), np.round(angle.ravel(), 5)])
     _, first, corners = np.unique(key, axis=0, return_index=True, return_inverse=True)
-    a, b, c = (points[faces[:, k]] for k in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    area = triangle_areas(points[faces])
     u = np.interp(angle.ravel()[first], *_by_area(angle, face_angle, area))
     v = np.interp(length.ravel()[first], *_by_area_over_radius(length, length.mean(1), radius[faces].mean(1), area))
     return np.column_stack([u, v]), corners.reshape(-1, 3)

@@ -85,6 +85,21 @@ def map_coordinates(
     return np.stack([column, row], -1)
 
 
+def texel_at(
+    uv: NDArray[np.floating],  # [N, 2]
+    resolution: int,
+    even: bool = False,
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Row [N] and column [N] of the texel that uv lies in. On the border of two it is the lower or right one, or with
+    `even` the one of an even number."""
+    if even:
+        column, row = np.round(map_coordinates(np.asarray(uv, np.float64), resolution)).T
+    else:
+        column, row = uv[:, 0] * resolution, (1 - uv[:, 1]) * resolution
+    row, column = (np.clip(place.astype(np.int64), 0, resolution - 1) for place in (row, column))
+    return row, column
+
+
 def grid_sample_coordinates(uv: Any) -> Any:
     """[..., 2] uv -> the `grid` of torch's grid_sample that samples a map where `sample_uv` does.
 
@@ -141,12 +156,17 @@ def chart_padding(
     `padded = np.where(index[..., None] >= 0, flat[index], fill)` widens the charts, so that bilinear samples at their
     borders do not mix with the background.
     """
-    from scipy.ndimage import distance_transform_cdt, distance_transform_edt
+    from scipy.ndimage import distance_transform_cdt
 
-    index = np.full(mask.shape, -1, np.int64)
     if not mask.any():
-        return index
+        return np.full(mask.shape, -1, np.int64)
     near = np.asarray(distance_transform_cdt(~mask, metric="chessboard")) <= texels
+    return np.where(near, nearest_on_chart(mask), -1)
+
+
+def nearest_on_chart(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """[R, R] for every texel the flat index of the nearest one on a chart (mask [R, R]): its own on one."""
+    from scipy.ndimage import distance_transform_edt
+
     row, column = np.asarray(distance_transform_edt(~mask, return_distances=False, return_indices=True))
-    index[near] = (row * mask.shape[1] + column)[near]
-    return index
+    return (row * mask.shape[1] + column).astype(np.int64)

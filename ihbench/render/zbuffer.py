@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.camera import whole_pixels
+from ihbench.render.triangles import triangle_crosses
 
 NEAR = 1e-3  # m; a triangle with a corner nearer than this is dropped, not clipped
 
@@ -96,8 +97,7 @@ def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.integer]) ->
     """[V, 3] unit normals, area-weighted over the faces around each vertex; 0 where there is no area. Raises as
     `rasterize`."""
     check_mesh(vertices, faces, "normals")
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    n = np.cross(b - a, c - a)
+    n = triangle_crosses(vertices[faces])
     out = np.zeros_like(vertices, dtype=np.float64)
     for axis in range(3):
         for corner in range(3):

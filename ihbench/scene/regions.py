@@ -76,14 +76,13 @@ class SurfaceMap:
 
     def labels_in(self, vertices: NDArray[np.float64], camera: Camera) -> NDArray[np.uint8]:
         """[H, W] label of the posed surface (vertices [V, 3] m, world) in every pixel, 0 where the body is not."""
-        size = len(self.labels)
+        from ihbench.body.uv import texel_at
+
         raster = rasterize(camera.project(vertices), self.body.faces, camera.height, camera.width)
         labels = np.zeros((camera.height, camera.width), np.uint8)
         hit = raster.mask
         uv = raster.interpolate(self.body.uv, self.body.uv_faces)[hit]
-        col = np.clip((uv[:, 0] * size).astype(int), 0, size - 1)
-        row = np.clip(((1 - uv[:, 1]) * size).astype(int), 0, size - 1)
-        labels[hit] = self.labels[row, col]
+        labels[hit] = self.labels[texel_at(uv, len(self.labels))]
         return labels
 
     def _surface_labels(self, vertices: NDArray[np.float64], view: TestView) -> NDArray[np.uint8]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ihbench.body import Body
 from ihbench.camera import Camera
+from ihbench.render.triangles import triangle_crosses
 from ihbench.render.zbuffer import rasterize
 
 N_PARTS = 24
@@ -42,8 +43,7 @@ def part_labels(
     on = raster.face >= 0
     face = raster.face[on]
     vertex = body.faces[face, raster.bary[on].argmax(1)]
-    a, b, c = (body.v_template[body.faces[face, k]] for k in range(3))
-    backward = np.cross(b - a, c - a)[:, 2] < 0
+    backward = triangle_crosses(body.v_template[body.faces[face]])[:, 2] < 0
     labels = np.full(on.shape, NO_PART, np.uint8)
     labels[on] = body.weights[vertex].argmax(1) + BACK * backward
     return labels

@@ -23,6 +23,7 @@ from ihbench.methods.inpainthuman.avatar.pose_residual import ResidualEncoder, r
 from ihbench.methods.inpainthuman.avatar.uv_features import UVFeatures, bilinear_corners
 from ihbench.methods.inpainthuman.config import InpaintHumanConfig, config_from
 from ihbench.render.splat import render_gaussians
+from ihbench.render.triangles import triangle_areas, triangle_crosses
 from ihbench.render.zbuffer import rasterize
 
 CULL_SLACK = 0.04  # m behind the nearest body surface; garments and offsets stay well within it
@@ -63,8 +64,7 @@ class GaussianAvatar(nn.Module):
         blended = np.einsum("nk,kab->nab", weights, body.joint_transforms(canonical)[:, :3])
         points = np.einsum("nab,nb->na", blended[:, :, :3], rest) + blended[:, :, 3]
 
-        corners = vertices[body.faces]
-        face_area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+        face_area = triangle_areas(vertices[body.faces])
         per_face = np.bincount(texels.face, minlength=len(body.faces))
         spacing = np.sqrt(_smoothed_area(texels.face, face_area, per_face, body.faces))
 
@@ -163,7 +163,7 @@ class GaussianAvatar(nn.Module):
         depth = maximum_filter(depth, size=3, mode="nearest")
         corners = vertices[self.body.faces[self.texels.face]]
         points = np.einsum("nk,nkd->nd", self.texels.bary, corners)
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals = triangle_crosses(corners)
         view = camera.center - points
         away = (normals * view).sum(1) < CULL_FACING * np.linalg.norm(normals, axis=1) * np.linalg.norm(view, axis=1)
         p = camera.project(points)

@@ -7,10 +7,9 @@ from functools import lru_cache
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
 from ihbench.body import Body
-from ihbench.body.uv import Texels, map_coordinates, texel_table
+from ihbench.body.uv import Texels, nearest_on_chart, texel_at, texel_table
 from ihbench.diffusion.crops.crop_view import CropView
 from ihbench.render.zbuffer import rasterize
 from ihbench.scene.visibility import FacedTexels
@@ -31,11 +30,9 @@ def pixel_texels(view: CropView, body: Body, texels: Texels) -> NDArray[np.int32
     height, width = view.unknown.shape
     raster = rasterize(view.camera.project(body.pose(view.body_pose)), body.faces, height, width)
     on = raster.mask
-    size = texels.resolution
     uv = raster.interpolate(body.uv, body.uv_faces)[on].astype(np.float64)
-    column, row = np.clip(np.round(map_coordinates(uv, size)), 0, size - 1).astype(np.int64).T
     out = np.full(on.shape, -1, np.int32)
-    out[on] = _number_map(body, size)[row, column]
+    out[on] = _number_map(body, texels.resolution)[texel_at(uv, texels.resolution, even=True)]
     return out
 
 
@@ -52,8 +49,7 @@ def _number_map(body: Body, resolution: int) -> NDArray[np.int32]:
     texels = texel_table(body, resolution)
     out = np.zeros(resolution**2, np.int32)
     out[texels.index] = np.arange(len(texels.index))
-    nearest = np.asarray(distance_transform_edt(~texels.mask, return_distances=False, return_indices=True))
-    return out.reshape(resolution, resolution)[tuple(nearest)]
+    return out[nearest_on_chart(texels.mask)]
 
 
 def _bilinear(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, median_filter
 
 from ihbench.body import Body
-from ihbench.body.uv import Texels
+from ihbench.body.uv import Texels, nearest_on_chart, texel_at
 from ihbench.camera import Camera
 from ihbench.render.zbuffer import rasterize
 from ihbench.scene.contracts import TrainingSet
@@ -48,11 +48,9 @@ class SeenSurface:
 
     def map_of(self, texels: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """[R, R] a property of the texels [N] as an image; off the charts the nearest texel's value."""
-        size = self.texels.resolution
-        flat = np.zeros(size**2, bool)
+        flat = np.zeros(self.texels.resolution**2, bool)
         flat[self.texels.index] = texels
-        nearest = distance_transform_edt(~self.texels.mask, return_distances=False, return_indices=True)
-        return flat.reshape(size, size)[tuple(np.asarray(nearest))]
+        return flat[nearest_on_chart(self.texels.mask)]
 
 
 def seen_surface(training: TrainingSet, facing: float = 0.0) -> SeenSurface:
@@ -77,10 +75,7 @@ def pixels_of(
         return out
     corners = body.uv[body.uv_faces[raster.face[on]]]
     uv = np.einsum("nk,nkd->nd", raster.bary[on], corners)
-    size = len(wanted)
-    column = np.clip((uv[:, 0] * size).astype(int), 0, size - 1)
-    row = np.clip(((1 - uv[:, 1]) * size).astype(int), 0, size - 1)
-    out[on] = wanted[row, column]
+    out[on] = wanted[texel_at(uv, len(wanted))]
     out = median_filter(out, size=3) & on  # a lone texel is not worth a painter
     nearest = distance_transform_edt(~on, return_distances=False, return_indices=True)
     distance = distance_transform_edt(~on)
