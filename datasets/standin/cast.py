@@ -1,11 +1,14 @@
-"""The names of stand-in people, and the mark on the folder that holds a cast."""
+"""What stand-ins of every data set share: the cast's names, its mark on the folder, and writing what is missing."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any, TypeVar
 
 from ihbench.body import Body, load_body
 from ihbench.clock.progress import Progress
@@ -17,26 +20,92 @@ from ihbench.files.locks import locked
 from ihbench.files.paths import user_path
 
 NAME_PREFIX = "standin-"
+WAITING_THREADS = 2  # beyond one a core: they wait for the disk while the others draw
+Item = TypeVar("Item")
 ADVICE = "choose another folder (--out, IHBENCH_CACHE)"
 
 
-def cast_names(count: int) -> list[str]:
-    """The names of the first `count` people of a cast."""
-    return [f"{NAME_PREFIX}{number}" for number in range(1, count + 1)]
+class StandIn(ABC):
+    """Makes captures of procedural people in a data set's own layout, so that the real loader reads them.
 
-
-def open_cast(root: Path, version: int, seed: int, subjects: list[str]) -> tuple[Path, list[Subject]]:
-    """The folder, marked as this cast's, and the people asked for.
-
-    Raises `BadInput` for an unknown subject, a negative seed, and a folder that holds something else.
+    A file depends on (version, seed, subject, camera, frame) only.
     """
-    root = user_path(root)
-    if seed < 0:
-        raise BadInput(f"stand-in seed {seed}: expected 0 or more")
-    numbers = [member_number(subject) for subject in subjects]
-    body = load_body()
-    claim(root, version, seed, body)
-    return root, [Subject(seed, number, body) for number in numbers]
+
+    version: int  # of the generator; a change that moves a pixel raises it
+    protocol: str  # what it is made for
+    n_frames: int
+    n_cameras = 1
+    folder_prefix = ""
+
+    @staticmethod
+    def subjects(count: int) -> list[str]:
+        """The names of the first `count` people of a cast."""
+        return [f"{NAME_PREFIX}{number}" for number in range(1, count + 1)]
+
+    @staticmethod
+    @abstractmethod
+    def camera_ids(subject: str) -> tuple[str, ...]:
+        """The cameras of a subject as its capture will name them."""
+
+    @classmethod
+    def ensure(
+        cls,
+        root: Path,
+        seed: int,
+        subjects: list[str],
+        wanted: Mapping[int, Iterable[int]],  # camera -> frames; what comes in one piece is made whole
+        progress: Progress | None = None,
+    ) -> Path:
+        """Write what is wanted and not yet there below `root`, and return `root`.
+
+        Interrupted, the same call goes on where it stopped. Raises `BadInput` for an unknown subject, camera or
+        frame, a negative seed, and when `root` holds something else.
+        """
+        frames_of = {camera: sorted(set(frames)) for camera, frames in sorted(wanted.items())}
+        for camera, frames in frames_of.items():
+            if not 0 <= camera < cls.n_cameras:
+                raise BadInput(f"stand-in camera {camera}: expected 0 to {cls.n_cameras - 1}")
+            for frame in frames:
+                if not 0 <= frame < cls.n_frames:
+                    raise BadInput(f"stand-in frame {frame}: expected 0 to {cls.n_frames - 1}")
+        root = user_path(root)
+        if seed < 0:
+            raise BadInput(f"stand-in seed {seed}: expected 0 or more")
+        numbers = [member_number(subject) for subject in subjects]
+        body = load_body()
+        claim(root, cls.version, seed, body)
+        progress = progress or Progress.silent()
+        for name, number in zip(subjects, numbers, strict=True):
+            folder = root / f"{cls.folder_prefix}{name}"
+            if cls.missing(folder, frames_of):
+                # a second process waits, then finds the files there
+                with locked(root / f".{name}.lock", ADVICE, wait=math.inf, on_wait=progress.say):
+                    if missing := cls.missing(folder, frames_of):
+                        cls.make(folder, name, Subject(seed, number, body), missing, progress)
+        return root
+
+    @staticmethod
+    @abstractmethod
+    def missing(folder: Path, frames_of: dict[int, list[int]]) -> Any:
+        """What is to be made of a subject; something false for nothing."""
+
+    @staticmethod
+    @abstractmethod
+    def make(folder: Path, name: str, subject: Subject, missing: Any, progress: Progress) -> None:
+        """Write it."""
+
+
+def in_threads(write: Callable[[Item], None], items: list[Item], label: str, progress: Progress) -> None:
+    """`write` every item, the first one alone: it computes what the threads share."""
+    with progress.task(label, total=len(items)) as task:
+        write(items[0])
+        task.advance()
+        pool = ThreadPoolExecutor((os.cpu_count() or 1) + WAITING_THREADS)
+        try:
+            for _ in pool.map(write, items[1:]):
+                task.advance()
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 def member_number(subject: str) -> int:
@@ -57,9 +126,9 @@ def claim(root: Path, version: int, seed: int, body: Body) -> None:
     }
     path = root / STANDIN_FILE
     if path.is_file():
-        found = atomic.read_json(path)
-        if found != mark:
-            raise BadInput(f"{root}: holds another stand-in ({_differences(found, mark)}); choose another folder")
+        present = atomic.read_json(path)
+        if present != mark:
+            raise BadInput(f"{root}: holds another stand-in ({_differences(present, mark)}); choose another folder")
         return
     if root.exists() and (not root.is_dir() or any(not _is_litter(entry.name) for entry in root.iterdir())):
         raise BadInput(f"{root}: not an empty folder and not a stand-in; choose another folder")
@@ -74,15 +143,8 @@ def _is_litter(name: str) -> bool:
     return name.startswith((f".{STANDIN_FILE}", f".{NAME_PREFIX}", ".DS_Store")) or name.lower() == "thumbs.db"
 
 
-@contextmanager
-def alone_with(root: Path, name: str, progress: Progress) -> Iterator[None]:
-    """Hold one person of a cast while the files are made. A second process waits, then finds them there."""
-    with locked(root / f".{name}.lock", ADVICE, wait=math.inf, on_wait=progress.say):
-        yield
-
-
-def _differences(found: object, asked: dict[str, object]) -> str:
-    if not isinstance(found, dict):
+def _differences(present: object, asked: dict[str, object]) -> str:
+    if not isinstance(present, dict):
         return "no readable mark"
-    differing = [key for key in asked if found.get(key) != asked[key]]
-    return ", ".join(f"{key} {found.get(key)!r}, asked for {asked[key]!r}" for key in differing) or "other keys"
+    differing = [key for key in asked if present.get(key) != asked[key]]
+    return ", ".join(f"{key} {present.get(key)!r}, asked for {asked[key]!r}" for key in differing) or "other keys"

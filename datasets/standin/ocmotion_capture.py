@@ -7,9 +7,6 @@ before the person (everything behind them stays).
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -18,58 +15,61 @@ from ihbench.camera import Camera, look_at
 from ihbench.clock.progress import Progress
 from ihbench.datasets.ocmotion import wild2avatar as ocmotion_w2a
 from ihbench.datasets.standin import motion
-from ihbench.datasets.standin.cast import alone_with, cast_names, open_cast
+from ihbench.datasets.standin.cast import StandIn, in_threads
 from ihbench.datasets.standin.furniture import furnish, furniture_view
-from ihbench.datasets.standin.photograph import photograph
 from ihbench.datasets.standin.studio import empty_studio
 from ihbench.datasets.standin.subject import Subject
 from ihbench.files import atomic
 from ihbench.files.pictures import encoded
 
-VERSION = 1  # of the generator; a change that moves a pixel raises it
 N_FRAMES = 100
 N_CAMERAS = 6  # of the rig; the images are of the first
 WIDTH, HEIGHT = 960, 720  # px
 REACH = 0.75  # m to either side that the person walks
 
 
-class OcMotionStandIn:
-    """Makes sequences of procedural people. A file depends on (VERSION, seed, subject, frame) only."""
+class OcMotionStandIn(StandIn):
+    """A sequence is made whole, whatever is wanted of it."""
 
-    version = VERSION
-    protocol = "ocmotion_visible"  # what it is made for
+    version = 1
+    protocol = "ocmotion_visible"
     n_frames = N_FRAMES
-    n_cameras = 1
-
-    @staticmethod
-    def subjects(count: int = 6) -> list[str]:
-        """The names of the first `count` people of a cast."""
-        return cast_names(count)
 
     @staticmethod
     def camera_ids(subject: str) -> tuple[str, ...]:
-        """The camera of a subject as its capture will name it."""
         return (ocmotion_w2a.camera_id(subject),)
 
     @staticmethod
-    def ensure(
-        root: Path,
-        seed: int,
-        subjects: list[str],
-        wanted: Mapping[int, Iterable[int]],  # a sequence is whole whatever is wanted of it
-        progress: Progress | None = None,
-    ) -> Path:
-        """Write what is not yet there of these sequences below `root`, and return `root`.
+    def missing(folder: Path, frames_of: dict[int, list[int]]) -> list[int]:
+        """Frames, by the file that is written last of each."""
+        last = (folder / "truth" / "masks" / f"{frame:05d}.png" for frame in range(N_FRAMES))
+        return [frame for frame, path in enumerate(last) if not path.is_file()]
 
-        Raises `BadInput` for an unknown subject and when `root` holds something else.
-        """
-        root, people = open_cast(root, VERSION, seed, subjects)
-        progress = progress or Progress.silent()
-        for name, person in zip(subjects, people, strict=True):
-            if _missing(root / name):
-                with alone_with(root, name, progress):
-                    _ensure_sequence(root / name, name, person, progress)
-        return root
+    @staticmethod
+    def make(folder: Path, name: str, subject: Subject, missing: list[int], progress: Progress) -> None:
+        names = [f"{frame:05d}" for frame in range(N_FRAMES)]
+        show = motion.stroll(subject.rng("stroll"), N_FRAMES, REACH)
+        poses = motion.body_poses(show, subject.betas, subject.body)
+        cameras = room_cameras(subject.rng("room"))
+        if not (folder / ocmotion_w2a.METADATA).is_file():
+            ocmotion_w2a.write_mesh_infos(folder, names, poses, subject.body)
+            ocmotion_w2a.write_all_cameras(folder, names, cameras)
+            ocmotion_w2a.write_sequence_metadata(folder, names, cameras[0], poses)  # is last: it stands for all three
+        room = empty_studio(cameras[0], subject.studio_seed)
+        furniture = furniture_view(furnish(subject.rng("furniture")), subject.lighting, cameras[0], room)
+
+        def write(k: int) -> None:
+            surface = subject.body.pose(poses[k], offsets=subject.offsets)
+            shot = subject.photograph(surface, cameras[0], furniture.image)
+            before = furniture.depth < shot.depth
+            image = np.where(before[..., None], furniture.image, shot.image)
+            ocmotion_w2a.write_frame(folder, names[k], image, shot.mask & ~before)
+            whole = encoded(shot.image, "JPEG", quality=95)
+            atomic.write_bytes(folder / "truth" / "images" / f"{names[k]}.jpg", whole, durable=False)
+            silhouette = encoded(shot.mask.astype(np.uint8) * 255, "PNG")
+            atomic.write_bytes(folder / "truth" / "masks" / f"{names[k]}.png", silhouette, durable=False)  # is last
+
+        in_threads(write, missing, f"filming {name}", progress)
 
 
 def room_cameras(rng: np.random.Generator) -> list[Camera]:
@@ -85,54 +85,3 @@ def room_cameras(rng: np.random.Generator) -> list[Camera]:
         K = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]])
         cameras.append(Camera(K, R, t, WIDTH, HEIGHT))
     return cameras
-
-
-def _missing(folder: Path) -> list[int]:
-    """The frames that are not there yet."""
-    last = (folder / "truth" / "masks" / f"{frame:05d}.png" for frame in range(N_FRAMES))
-    return [frame for frame, path in enumerate(last) if not path.is_file()]
-
-
-def _ensure_sequence(folder: Path, name: str, subject: Subject, progress: Progress) -> None:
-    names = [f"{frame:05d}" for frame in range(N_FRAMES)]
-    missing = _missing(folder)
-    if not missing:  # another process has made them meanwhile
-        return
-    show = motion.stroll(subject.rng("stroll"), N_FRAMES, REACH)
-    poses = motion.body_poses(show, subject.betas, subject.body)
-    cameras = room_cameras(subject.rng("room"))
-    if not (folder / ocmotion_w2a.METADATA).is_file():
-        ocmotion_w2a.write_mesh_infos(folder, names, poses, subject.body)
-        ocmotion_w2a.write_all_cameras(folder, names, cameras)
-        ocmotion_w2a.write_sequence_metadata(folder, names, cameras[0], poses)  # is last: it stands for all three
-    room = empty_studio(cameras[0], subject.studio_seed)
-    furniture = furniture_view(furnish(subject.rng("furniture")), subject.lighting, cameras[0], room)
-
-    def write(k: int) -> None:
-        surface = subject.body.pose(poses[k], offsets=subject.offsets)
-        shot = photograph(
-            surface,
-            subject.body,
-            subject.texture,
-            subject.labels,
-            subject.lighting,
-            cameras[0],
-            furniture.image,
-        )
-        before = furniture.depth < shot.depth
-        image = np.where(before[..., None], furniture.image, shot.image)
-        ocmotion_w2a.write_frame(folder, names[k], image, shot.mask & ~before)
-        whole = encoded(shot.image, "JPEG", quality=95)
-        atomic.write_bytes(folder / "truth" / "images" / f"{names[k]}.jpg", whole, durable=False)
-        silhouette = encoded(shot.mask.astype(np.uint8) * 255, "PNG")
-        atomic.write_bytes(folder / "truth" / "masks" / f"{names[k]}.png", silhouette, durable=False)  # is last
-
-    with progress.task(f"filming {name}", total=len(missing)) as task:
-        write(missing[0])  # computes what the threads share before they start
-        task.advance()
-        pool = ThreadPoolExecutor((os.cpu_count() or 1) + 1)
-        try:
-            for _ in pool.map(write, missing[1:]):
-                task.advance()
-        finally:
-            pool.shutdown(cancel_futures=True)

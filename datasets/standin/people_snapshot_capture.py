@@ -7,7 +7,7 @@ Beside each subject's files lies `truth/`, which no loader reads: the texture an
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -20,59 +20,37 @@ from ihbench.camera import Camera, look_at
 from ihbench.clock.progress import Progress
 from ihbench.datasets.people_snapshot import original as people_snapshot
 from ihbench.datasets.standin import motion
-from ihbench.datasets.standin.cast import alone_with, cast_names, open_cast
-from ihbench.datasets.standin.photograph import Photograph, photograph
+from ihbench.datasets.standin.cast import StandIn
+from ihbench.datasets.standin.photograph import Photograph
 from ihbench.datasets.standin.studio import empty_studio
 from ihbench.datasets.standin.subject import Subject
 from ihbench.files import atomic
 from ihbench.files.pictures import encoded
 
-VERSION = 1  # of the generator; a change that moves a pixel raises it
 TURN_FRAMES, TEST_FRAMES = 160, 80
 N_FRAMES = TURN_FRAMES + TEST_FRAMES
 TURNS = 1.5
 SIZE = 1080  # px
 
 
-class PeopleSnapshotStandIn:
-    """Makes captures of procedural people. A file depends on (VERSION, seed, subject) only."""
+class PeopleSnapshotStandIn(StandIn):
+    """A subject is made whole, whatever is wanted of it."""
 
-    version = VERSION
-    protocol = "people_snapshot_occ"  # what it is made for
+    version = 1
+    protocol = "people_snapshot_occ"
     n_frames = N_FRAMES
-    n_cameras = 1
-
-    @staticmethod
-    def subjects(count: int = 4) -> list[str]:
-        """The names of the first `count` people of a cast."""
-        return cast_names(count)
 
     @staticmethod
     def camera_ids(subject: str) -> tuple[str, ...]:
-        """The camera of a subject as its capture will name it."""
         return people_snapshot.SnapshotFolder.camera_ids
 
     @staticmethod
-    def ensure(
-        root: Path,
-        seed: int,
-        subjects: list[str],
-        wanted: Mapping[int, Iterable[int]],  # the video is whole whatever is wanted of it
-        progress: Progress | None = None,
-    ) -> Path:
-        """Write the subjects that are not yet there below `root`, and return `root`.
+    def missing(folder: Path, frames_of: dict[int, list[int]]) -> bool:
+        return not (folder / people_snapshot.POSES_FILE).is_file()  # written last
 
-        Raises `BadInput` for an unknown subject and when `root` holds something else.
-        """
-        root, people = open_cast(root, VERSION, seed, subjects)
-        progress = progress or Progress.silent()
-        for name, person in zip(subjects, people, strict=True):
-            last = root / name / people_snapshot.POSES_FILE
-            if not last.is_file():
-                with alone_with(root, name, progress):
-                    if not last.is_file():
-                        _write_subject(root / name, name, person, progress)
-        return root
+    @staticmethod
+    def make(folder: Path, name: str, subject: Subject, missing: bool, progress: Progress) -> None:
+        _write_subject(folder, name, subject, progress)
 
 
 def studio_camera(rng: np.random.Generator) -> Camera:
@@ -106,9 +84,7 @@ def _write_subject(folder: Path, name: str, subject: Subject, progress: Progress
 
     def shoot(frame: int) -> Photograph:
         surface = subject.body.pose(poses[frame], offsets=subject.offsets)
-        return photograph(
-            surface, subject.body, subject.texture, subject.labels, subject.lighting, camera, background
-        )
+        return subject.photograph(surface, camera, background)
 
     def frames(pool: ThreadPoolExecutor) -> Iterator[NDArray[np.uint8]]:
         with progress.task(f"filming {name}", total=N_FRAMES) as task:

@@ -13,6 +13,7 @@ from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.datasets.standin import motion, outfit
 from ihbench.datasets.standin.lighting import Lighting, studio_lighting
+from ihbench.datasets.standin.photograph import Photograph, photograph
 from ihbench.datasets.standin.rig import camera_ring
 
 # what each member of a cast does; odd members turn all the way round, even ones look about
@@ -113,3 +114,11 @@ class Subject:
     def clothed_vertices(self, frame: int) -> NDArray[np.float64]:
         """[V, 3] m, world: the true surface with cloth and hair."""
         return self.body.pose(self.body_poses[frame], offsets=self.offsets)
+
+    def photograph(
+        self,
+        vertices: NDArray[np.float64],  # [V, 3] m, world: the clothed surface
+        camera: Camera,
+        background: NDArray[np.uint8],  # [H, W, 3] sRGB, what this camera sees without the person
+    ) -> Photograph:
+        return photograph(vertices, self.body, self.texture, self.labels, self.lighting, camera, background)

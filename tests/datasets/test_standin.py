@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from ihbench.body import JOINT_INDEX, load_body
 from ihbench.camera import Camera
-from ihbench.datasets.standin import motion, outfit, zju_capture
+from ihbench.datasets.standin import motion, outfit
 from ihbench.datasets.standin.lighting import studio_lighting
 from ihbench.datasets.standin.noise import fractal_noise, value_noise
 from ihbench.datasets.standin.photograph import photograph
@@ -89,7 +89,7 @@ def test_interrupted_and_lost_files_are_made_again(root, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(zju_capture, "photograph", killed)
+        patch.setattr(Subject, "photograph", killed)
         with pytest.raises(KeyboardInterrupt):
             ZjuStandIn.ensure(root, 0, [SUBJECT], WANTED)
     assert set(files_below(root)) == set(before) - set(lost)
