@@ -19,7 +19,7 @@ TRAINING = "training"  # folder in the output: state and loss curve
 class TrainMiniOptions:
     out: Path
     """Folder of the backbone; its folder `training` holds the state, so that the same command goes on."""
-    album: Path | None = None
+    dataset: Path | None = None
     """Folder of the photographs; by default in the cache."""
     train: MiniTraining = field(default_factory=MiniTraining)
     """How it is trained."""
@@ -59,16 +59,16 @@ def _train(chosen: Any) -> dict[str, Any]:
     if chosen.start is not None:
         check_mini(chosen.start)  # before hours of photographs
     _check_out(chosen.out)
-    album = chosen.album or cache_folder() / "album"
+    dataset = chosen.dataset or cache_folder() / "crops"
     # a GPU waits for one process that draws occluders; on the CPU more processes would only take from each other
     workers = 0 if chosen.device == "cpu" else max((os.cpu_count() or 1) - 2, 0)
     with locked(chosen.out / TRAINING / "lock", "choose another --out folder"):
         trainer = MiniTrainer(
-            chosen.train, chosen.out / TRAINING, album, Progress(), chosen.device, workers, start=chosen.start
+            chosen.train, chosen.out / TRAINING, dataset, Progress(), chosen.device, workers, start=chosen.start
         )
         backbone = trainer.run()
         save_mini(backbone, chosen.out)
-        result = validate(backbone, album, chosen.train.each, Progress())
+        result = validate(backbone, dataset, chosen.train.each, Progress())
         write_card(chosen.out, chosen.train, trainer.seconds, result, chosen.device, chosen.start)
     return result
 

@@ -69,7 +69,7 @@ def sampler_rows(
 def hidden_middle(size: int) -> CropView:
     """A procedural person's crop, `size` px tall, with the middle half of its rows unknown."""
     body = load_body()
-    shot = registry.load("people", registry.names("people")[0]).meet(0, body, 1).snapshots[0]
+    shot = registry.load("people", registry.names("people")[0]).draw_person(0, body, 1).snapshots[0]
     state = np.where(shot.silhouette, MaskState.PERSON, MaskState.BACKGROUND).astype(np.uint8)
     whole = cut_view(TrainView(shot.image, state, shot.camera, shot.body_pose, 0, "0"), 0, body, size)
     unknown = np.zeros_like(whole.unknown)

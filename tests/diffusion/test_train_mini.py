@@ -14,8 +14,8 @@ from ihbench import bounds
 from ihbench.cli import main
 from ihbench.clock.progress import Progress
 from ihbench.clock.threads import one_torch_thread
-from ihbench.diffusion.crops import crop_album
-from ihbench.diffusion.crops.crop_album import CropAlbum
+from ihbench.diffusion.crops import crop_dataset
+from ihbench.diffusion.crops.crop_dataset import CropDataset
 from ihbench.diffusion.mini import batches as mini_batches
 from ihbench.diffusion.mini import model as mini_model
 from ihbench.diffusion.mini import train_mini
@@ -48,7 +48,7 @@ def small(monkeypatch):
     """Two people a page, tiny networks and crops."""
     without_bounds(monkeypatch)
     monkeypatch.setattr(mini_model, "CHANNELS", (32, 32, 32))
-    for module in (crop_album, train_mini, mini_validation):
+    for module in (crop_dataset, train_mini, mini_validation):
         monkeypatch.setattr(module, "PAGE", 2)
     for module in (mini_model, mini_batches, train_mini, mini_weights):
         monkeypatch.setattr(module, "SIZE", SIDE)
@@ -58,18 +58,18 @@ def small(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def album(tmp_path_factory):
-    return tmp_path_factory.mktemp("album")
+def dataset(tmp_path_factory):
+    return tmp_path_factory.mktemp("dataset")
 
 
 class Killed(Exception):
     pass
 
 
-def test_killed_and_resumed_ends_the_same(tmp_path, album, monkeypatch):
-    whole = MiniTrainer(SMALL, tmp_path / "whole", album, QUIET)
+def test_killed_and_resumed_ends_the_same(tmp_path, dataset, monkeypatch):
+    whole = MiniTrainer(SMALL, tmp_path / "whole", dataset, QUIET)
     whole.run()
-    part = MiniTrainer(SMALL, tmp_path / "part", album, QUIET)
+    part = MiniTrainer(SMALL, tmp_path / "part", dataset, QUIET)
     honest = part._one_step
 
     def step(batch):
@@ -81,7 +81,7 @@ def test_killed_and_resumed_ends_the_same(tmp_path, album, monkeypatch):
     monkeypatch.setattr(part, "_one_step", step)
     with pytest.raises(Killed):
         part.run()
-    again = MiniTrainer(SMALL, tmp_path / "part", album, QUIET)
+    again = MiniTrainer(SMALL, tmp_path / "part", dataset, QUIET)
     assert again.step == 2
     again.run()
     for name in train_mini.TRAINED:
@@ -89,8 +89,8 @@ def test_killed_and_resumed_ends_the_same(tmp_path, album, monkeypatch):
     assert [row["step"] for row in curve_of(tmp_path / "part")] == [4]
 
 
-def test_worker_processes_make_the_same_batches(tmp_path, album):
-    batches = MiniTrainer(SMALL, tmp_path, album, QUIET).batches
+def test_worker_processes_make_the_same_batches(tmp_path, dataset):
+    batches = MiniTrainer(SMALL, tmp_path, dataset, QUIET).batches
     for step, made in enumerate(batches.stream(0, 3, workers=2)):
         own = batches[step]
         assert made.noise_seed == own.noise_seed
@@ -98,9 +98,9 @@ def test_worker_processes_make_the_same_batches(tmp_path, album):
         assert torch.equal(made.ids, own.ids)
 
 
-def test_half_precision_arithmetic_is_close(tmp_path, album):
-    full = MiniTrainer(SMALL, tmp_path / "full", album, QUIET)
-    half = MiniTrainer(replace(SMALL, precision="bfloat16"), tmp_path / "half", album, QUIET)
+def test_half_precision_arithmetic_is_close(tmp_path, dataset):
+    full = MiniTrainer(SMALL, tmp_path / "full", dataset, QUIET)
+    half = MiniTrainer(replace(SMALL, precision="bfloat16"), tmp_path / "half", dataset, QUIET)
     batch = full.batches[0]
     with torch.no_grad():
         expected, found = full.loss(batch).item(), half.loss(batch).item()
@@ -108,23 +108,23 @@ def test_half_precision_arithmetic_is_close(tmp_path, album):
     assert found == pytest.approx(expected, rel=0.02)
 
 
-def test_another_configuration_does_not_go_on(tmp_path, album):
-    trainer = MiniTrainer(SMALL, tmp_path, album, QUIET)
+def test_another_configuration_does_not_go_on(tmp_path, dataset):
+    trainer = MiniTrainer(SMALL, tmp_path, dataset, QUIET)
     trainer._one_step(trainer.batches[0])
     trainer.step = 1
     trainer.save()
     with pytest.raises(BadInput, match="other lr"):
-        MiniTrainer(replace(SMALL, lr=1e-3), tmp_path, album, QUIET)
-    assert MiniTrainer(replace(SMALL, steps=9), tmp_path, album, QUIET).step == 1
+        MiniTrainer(replace(SMALL, lr=1e-3), tmp_path, dataset, QUIET)
+    assert MiniTrainer(replace(SMALL, steps=9), tmp_path, dataset, QUIET).step == 1
     (tmp_path / train_mini.STATE).write_bytes(b"damaged")
     with pytest.raises(BadInput, match="not a readable training state"):
-        MiniTrainer(SMALL, tmp_path, album, QUIET)
+        MiniTrainer(SMALL, tmp_path, dataset, QUIET)
 
 
-def test_a_training_starts_from_an_earlier_backbone(tmp_path, album):
-    earlier = MiniTrainer(SMALL, tmp_path / "earlier", album, QUIET)
+def test_a_training_starts_from_an_earlier_backbone(tmp_path, dataset):
+    earlier = MiniTrainer(SMALL, tmp_path / "earlier", dataset, QUIET)
     save_mini(earlier.backbone, tmp_path / "folder")
-    later = MiniTrainer(replace(SMALL, seed=5), tmp_path / "later", album, QUIET, start=tmp_path / "folder")
+    later = MiniTrainer(replace(SMALL, seed=5), tmp_path / "later", dataset, QUIET, start=tmp_path / "folder")
     for name in (*train_mini.TRAINED, "codec"):
         for key, value in weights(getattr(earlier.backbone, name)).items():
             found = weights(getattr(later.backbone, name))[key]
@@ -132,17 +132,17 @@ def test_a_training_starts_from_an_earlier_backbone(tmp_path, album):
     torch.testing.assert_close(later.channel_weight, earlier.channel_weight)
     save_mini(tiny_backbone(), tmp_path / "other")
     with pytest.raises(BadInput, match="--start: a backbone that knows other words"):
-        MiniTrainer(SMALL, tmp_path / "never", album, QUIET, start=tmp_path / "other")
+        MiniTrainer(SMALL, tmp_path / "never", dataset, QUIET, start=tmp_path / "other")
 
 
-def test_people_come_in_pages(tmp_path, album):
+def test_people_come_in_pages(tmp_path, dataset):
     with pytest.raises(BadInput, match="multiple of 2"):
-        MiniTrainer(MiniTraining(people=3, each=2), tmp_path, album, QUIET)
+        MiniTrainer(MiniTraining(people=3, each=2), tmp_path, dataset, QUIET)
 
 
-def test_the_loss_sees_the_prompted_traits(tmp_path, album):
+def test_the_loss_sees_the_prompted_traits(tmp_path, dataset):
     """Trait tokens reach the text encoder's output of told prompts alone."""
-    trainer = MiniTrainer(MiniTraining(people=2, each=2, traits=1.0, captions=0.0), tmp_path, album, QUIET)
+    trainer = MiniTrainer(MiniTraining(people=2, each=2, traits=1.0, captions=0.0), tmp_path, dataset, QUIET)
     words = replace(trainer.batches[0], traits=torch.from_numpy(trainer.batches.crops.traits))
     prompts, told = trainer.batches.words(np.random.default_rng(0), np.array([0, 1]))
     assert told == [True, True]
@@ -157,17 +157,17 @@ def test_an_album_is_made_where_processes_cannot_share_memory(tmp_path, monkeypa
     def refuses(*_, **__):
         raise OSError(38, "Function not implemented")
 
-    monkeypatch.setattr(crop_album, "ProcessPoolExecutor", refuses)
-    store = CropAlbum(tmp_path, "procedural", 2, SIDE)
+    monkeypatch.setattr(crop_dataset, "ProcessPoolExecutor", refuses)
+    store = CropDataset(tmp_path, "procedural", 2, SIDE)
     store.make(0, 2, QUIET)
     assert len(list(store.pages(0, 2))) == 1
 
 
 def test_album_pages_are_written_whole_and_read_back(tmp_path):
-    store = CropAlbum(tmp_path, "procedural", 2, SIDE)
+    store = CropDataset(tmp_path, "procedural", 2, SIDE)
     store.make(0, 2, QUIET)
     (page,) = store.pages(0, 2)
-    fresh = crop_album.make_page("procedural", 0, 2, 2, SIDE)
+    fresh = crop_dataset.make_page("procedural", 0, 2, 2, SIDE)
     assert (page.images == fresh.images).all()
     assert page.phrases == fresh.phrases
     assert set(page.widths) <= {SIDE // 2, 5 * SIDE // 8, 3 * SIDE // 4, SIDE}
@@ -258,9 +258,9 @@ class TestWeights:
         assert said in str(caught.value)
 
 
-def test_the_command_trains_validates_and_writes_a_card(tmp_path, capsys, monkeypatch, album):
+def test_the_command_trains_validates_and_writes_a_card(tmp_path, capsys, monkeypatch, dataset):
     monkeypatch.setattr(mini_validation, "STEPS", (1,))
-    words = ["train-mini", "--out", str(tmp_path), "--album", str(album), "--json", "--train.people", "2"]
+    words = ["train-mini", "--out", str(tmp_path), "--dataset", str(dataset), "--json", "--train.people", "2"]
     words += ["--train.each", "2", "--train.steps", "2"]
     assert main(words) == 0
     result = json.loads(capsys.readouterr().out)
@@ -276,7 +276,7 @@ def test_the_command_trains_validates_and_writes_a_card(tmp_path, capsys, monkey
 
 
 @pytest.mark.parametrize("start", [False, True])
-def test_another_model_of_the_same_folders_is_not_written_over(tmp_path, capsys, album, start):
+def test_another_model_of_the_same_folders_is_not_written_over(tmp_path, capsys, dataset, start):
     """Stable Diffusion has a `unet` too; and the backbone to start from is nobody's place to train in."""
     out = tmp_path / "model"
     if start:
@@ -285,7 +285,15 @@ def test_another_model_of_the_same_folders_is_not_written_over(tmp_path, capsys,
         (out / "unet").mkdir(parents=True)
         (out / "unet" / "config.json").write_text('{"_class_name": "UNet2DConditionModel"}')
     before = contents(out)
-    words = ["train-mini", "--out", str(out / "." if start else out), "--album", str(album), "--train.people", "2"]
+    words = [
+        "train-mini",
+        "--out",
+        str(out / "." if start else out),
+        "--dataset",
+        str(dataset),
+        "--train.people",
+        "2",
+    ]
     assert main([*words, *(("--start", str(out)) if start else ())]) == 2
     assert "folder" in capsys.readouterr().err
     assert contents(out) == before

@@ -276,7 +276,7 @@ def cut_short() -> Iterator[None]:
         ),
         *("ihbench.stress.run.run_cases", "ihbench.kernels.table.run_kernels", "ihbench.metrics.weights.fetch"),
         "ihbench.methods.inpainthuman.studies.paint_table.paint_scene",
-        "ihbench.diffusion.crops.crop_album.CropAlbum.make",
+        "ihbench.diffusion.crops.crop_dataset.CropDataset.make",
         "ihbench.datasets.standin.photograph.photograph",
     )
     with contextlib.ExitStack() as stack:

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from ihbench.diffusion.backbone import padded_ids
-from ihbench.diffusion.crops.crop_album import Page
+from ihbench.diffusion.crops.crop_dataset import Page
 from ihbench.diffusion.crops.random_mask import random_mask
 from ihbench.diffusion.mini.model import SIZE
 from ihbench.diffusion.mini.training import MiniTraining
@@ -24,7 +24,7 @@ USUAL_WIDTH = 0.75  # of a crop, as a share of its height
 
 
 class Crops:
-    """All crops of an album, by width."""
+    """All crops of a dataset, by width."""
 
     def __init__(self, pages: list[Page]):
         starts = np.cumsum([0, *(len(page.phrases) for page in pages)])

@@ -51,7 +51,7 @@ def write_card(
         "at a hundredth of its size, for crops 128 px tall. It knows procedural people and nothing else: it is there",
         "to run InpaintHuman without any download, on stand-ins; real people want real weights.",
         "",
-        f"- Data: people 0 to {config.people - 1} of `datasets/standin/passers_by.py` version {people.VERSION}, "
+        f"- Data: people 0 to {config.people - 1} of `datasets/standin/training_people.py` version {people.VERSION}, "
         f"{config.each} photographs each.",
         "  Stand-ins of the protocols come from another random stream; none of them is in it.",
         f"- {config.steps} steps of about {config.batch} crops in {config.precision}, {seconds / 60:.0f} minutes on "

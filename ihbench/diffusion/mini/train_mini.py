@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from ihbench import registry
 from ihbench.clock.progress import Progress
 from ihbench.diffusion.backbone import Backbone, shrink_mask
-from ihbench.diffusion.crops.crop_album import PAGE, CropAlbum
+from ihbench.diffusion.crops.crop_dataset import PAGE, CropDataset
 from ihbench.diffusion.crops.part_map import part_colours
 from ihbench.diffusion.mini.batches import TRAIT_TOKENS, Batches, Crops, MiniBatch
 from ihbench.diffusion.mini.model import SIZE, TEXT_WIDTH, new_mini
@@ -55,13 +55,13 @@ class TraitTokens(nn.Module):
 
 
 class MiniTrainer:
-    """A training in a folder: its album, its state, its loss curve."""
+    """A training in a folder: its dataset, its state, its loss curve."""
 
     def __init__(
         self,
         config: MiniTraining,
         folder: Path,
-        album: Path,
+        dataset: Path,
         progress: Progress,
         device: str = "cpu",
         workers: int = 0,
@@ -72,7 +72,7 @@ class MiniTrainer:
         self.config, self.folder, self.progress = config, Path(folder), progress
         self.device, self.workers = torch.device(device), workers
         people = registry.load("people", "procedural")
-        store = CropAlbum(album, "procedural", config.each, SIZE)
+        store = CropDataset(dataset, "procedural", config.each, SIZE)
         store.make(0, config.people, progress)
         crops = Crops(list(store.pages(0, config.people)))
         self.backbone = new_mini(people.vocabulary(), config.seed)

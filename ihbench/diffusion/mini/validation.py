@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ihbench import registry
 from ihbench.clock.progress import Progress
 from ihbench.diffusion.backbone import Backbone
-from ihbench.diffusion.crops.crop_album import PAGE, CropAlbum
+from ihbench.diffusion.crops.crop_dataset import PAGE, CropDataset
 from ihbench.diffusion.crops.diffusion_batch import DiffusionBatch, shared_noise
 from ihbench.diffusion.crops.part_map import part_colours
 from ihbench.diffusion.crops.push_pull import push_pull
@@ -26,10 +26,10 @@ STRIP = 0.5  # share of the person that the central strip hides
 PEOPLE = 48
 
 
-def validate(backbone: Backbone, album: Path, each: int, progress: Progress) -> dict[str, Any]:
+def validate(backbone: Backbone, dataset: Path, each: int, progress: Progress) -> dict[str, Any]:
     """Hidden-body PSNR, pooled, on held-out people with a central strip; nothing is personalised."""
     people, device = registry.load("people", "procedural"), backbone.device
-    store = CropAlbum(album, "procedural", each, backbone.size)
+    store = CropDataset(dataset, "procedural", each, backbone.size)
     store.make(people.HELD_OUT, PAGE, progress)
     page = next(iter(store.pages(people.HELD_OUT, PAGE)))
     errors: dict[str, list[NDArray[np.float64]]] = {}

@@ -1,4 +1,4 @@
-"""The album that `mini` learns from: crops of procedural people, kept in files of a hundred people each."""
+"""The dataset that `mini` learns from: crops of procedural people, kept in files of a hundred people each."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ class Page:
 
 
 def make_page(people: str, start: int, count: int, each: int, size: int) -> Page:
-    """Meet `count` people from number `start`, and crop `each` photographs of every one."""
-    meet, body = registry.load("people", people).meet, load_body()
-    found: dict[str, list[Any]] = {name: [] for name in ("widths", "images", "silhouettes", "parts", "person")}
+    """Draw `count` people from number `start`, and crop `each` photographs of every one."""
+    draw_person, body = registry.load("people", people).draw_person, load_body()
+    columns: dict[str, list[Any]] = {name: [] for name in ("widths", "images", "silhouettes", "parts", "person")}
     phrases, traits = [], []
     for k in range(count):
-        person = meet(start + k, body, each)
+        person = draw_person(start + k, body, each)
         rng = np.random.default_rng((start + k, 7))
         phrases.append(person.phrases)
         traits.append(person.traits)
@@ -58,17 +58,17 @@ def make_page(people: str, start: int, count: int, each: int, size: int) -> Page
             crop = person_crop(shot.camera, vertices, size, padding=padding)
             padded = ((0, 0), (0, size - crop.width))
             labels = part_labels(vertices, body, crop.camera(shot.camera))
-            found["widths"].append(crop.width)
-            found["images"].append(np.pad(crop.cut(shot.image, 255), (*padded, (0, 0))))
-            found["silhouettes"].append(np.pad(crop.cut(shot.silhouette) > 0.5, padded))
-            found["parts"].append(np.pad(labels, padded))
-            found["person"].append(k)
-    arrays = {name: np.array(values) for name, values in found.items()}
+            columns["widths"].append(crop.width)
+            columns["images"].append(np.pad(crop.cut(shot.image, 255), (*padded, (0, 0))))
+            columns["silhouettes"].append(np.pad(crop.cut(shot.silhouette) > 0.5, padded))
+            columns["parts"].append(np.pad(labels, padded))
+            columns["person"].append(k)
+    arrays = {name: np.array(values) for name, values in columns.items()}
     return Page(**arrays, phrases=phrases, traits=np.array(traits, np.float32))
 
 
-class CropAlbum:
-    """Pages `start / PAGE` onwards of an album in a folder; made when they are missing, each written whole."""
+class CropDataset:
+    """Pages `start / PAGE` onwards of a dataset in a folder; made when they are missing, each written whole."""
 
     def __init__(self, folder: Path, people: str, each: int, size: int):
         self.people, self.each, self.size = people, each, size
@@ -81,7 +81,7 @@ class CropAlbum:
     def make(self, start: int, count: int, progress: Progress) -> None:
         """Make sure that people `start` to `start + count` are there. Raises `BadInput` for a partial page."""
         if start % PAGE or count % PAGE:
-            raise BadInput(f"album: people come in pages of {PAGE}, got {start} and {count}")
+            raise BadInput(f"dataset: people come in pages of {PAGE}, got {start} and {count}")
         missing = [s for s in range(start, start + count, PAGE) if not self.path(s).is_file()]
         if not missing:
             return
@@ -119,5 +119,5 @@ def _read_page(path: Path) -> Page:
         return Page(**arrays, phrases=[tuple(str(word).split("\n")) for word in words])
     except (BadInput, KeyError, TypeError) as error:
         raise BadInput(
-            f"{path}: not a readable page of an album ({error}); remove it and it is made again"
+            f"{path}: not a readable page of a dataset ({error}); remove it and it is made again"
         ) from error

@@ -1,6 +1,6 @@
-"""Passers-by: procedural people to train on, with captions. None of them is a stand-in that a protocol scores.
+"""Procedural people to train on, with captions. None of them is a stand-in that a protocol scores.
 
-A stand-in is drawn from (seed, member of the cast); a passer-by from its own stream, keyed by `STREAM` and a number.
+A stand-in is drawn from (seed, member of the cast); these come from their own stream, keyed by `STREAM` and a number.
 Numbers below `HELD_OUT` are for training, the others for validation.
 """
 
@@ -23,7 +23,7 @@ from ihbench.datasets.standin.subject import ROUTINES
 VERSION = 1
 STREAM = (86, *b"passer-by")  # stand-ins' streams are (seed, number, *words); no word of theirs is this one
 HELD_OUT = 1_000_000
-TEXTURE = 256  # px; a passer-by is photographed about 180 px tall
+TEXTURE = 256  # px; they are photographed about 180 px tall
 ALTERED = 0.75  # share of the garments whose colours are drawn anew instead of tinted
 EXERCISES = sorted({name for routine in ROUTINES for name in routine})
 
@@ -56,7 +56,7 @@ CUTS = ("short", "crop", "bob")
 
 @dataclass(frozen=True)
 class Snapshot:
-    """One photograph of a passer-by on white."""
+    """One photograph of a person on white."""
 
     image: NDArray[np.uint8]  # [H, W, 3]
     silhouette: NDArray[np.bool_]  # [H, W]
@@ -65,7 +65,7 @@ class Snapshot:
 
 
 @dataclass(frozen=True)
-class PasserBy:
+class TrainingPerson:
     phrases: tuple[str, ...]  # the caption without "a photo of a person": any of them may be left out
     traits: NDArray[np.float32]  # [N_TRAITS] what the caption describes, in numbers
     snapshots: list[Snapshot]
@@ -80,10 +80,10 @@ def vocabulary() -> tuple[str, ...]:
     return tuple(sorted(words))
 
 
-def meet(number: int, body: Body, count: int) -> PasserBy:
-    """Passer-by `number`, photographed `count` times in varied poses, from varied cameras. Pure in its arguments."""
+def draw_person(number: int, body: Body, count: int) -> TrainingPerson:
+    """Person `number`, photographed `count` times in varied poses, from varied cameras. Pure in its arguments."""
     if number < 0 or count < 1:
-        raise ValueError(f"passer-by {number}, {count} photographs: expected 0 or more and 1 or more")
+        raise ValueError(f"person {number}, {count} photographs: expected 0 or more and 1 or more")
     rng = np.random.default_rng([*STREAM, number])
     style = draw_style(rng)
     betas = np.clip(rng.normal(0, 0.9, 10), -1.8, 1.8)
@@ -97,7 +97,7 @@ def meet(number: int, body: Body, count: int) -> PasserBy:
         white = np.full((camera.height, camera.width, 3), 255, np.uint8)
         shot = photograph(body.pose(pose, offsets=offsets), body, texture, labels, lighting, camera, white)
         shots.append(Snapshot(shot.image, shot.mask, camera, pose))
-    return PasserBy(phrases(style), traits(style), shots)
+    return TrainingPerson(phrases(style), traits(style), shots)
 
 
 def draw_style(rng: np.random.Generator) -> outfit.Style:
@@ -197,4 +197,4 @@ def traits(style: outfit.Style) -> NDArray[np.float32]:
     return np.array([*(2 * np.ravel(colours) - 1), *lengths, *one_hot], np.float32)
 
 
-Meet = Callable[[int, Body, int], PasserBy]
+DrawPerson = Callable[[int, Body, int], TrainingPerson]
