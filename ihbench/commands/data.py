@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -64,6 +64,7 @@ def main(argv: list[str]) -> int:
 def _check(chosen: Check) -> int:
     from ihbench.body import load_body
     from ihbench.data.data_check import add_fitness
+    from ihbench.data.mesh_check import look_at_mesh
     from ihbench.scene.data_source import body_file, folder_nearby, is_about_a_file, own_body, own_data
 
     folder = own_data(chosen.folder)
@@ -80,6 +81,9 @@ def _check(chosen: Check) -> int:
             complaints.append(f"{name}: {error}")
             continue
         add_fitness(report, folder, body, chosen.overlays)
+        if body is not None:
+            mesh, warnings = look_at_mesh(body)
+            report = replace(report, body_mesh=mesh, warnings=warnings)
         print(json.dumps(report.as_json()) if chosen.json else "\n".join(_lines(report.as_json())))
         return 0 if report.ok else 1
     other = folder_nearby(folder, registry.names("dataset"))

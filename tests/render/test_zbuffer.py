@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import trimesh
 
 from ihbench.render.zbuffer import rasterize, vertex_normals
 
@@ -57,6 +58,28 @@ def test_interpolation_is_perspective_correct(backend):
     rows, cols = np.nonzero(raster.mask)
     np.testing.assert_allclose(focal * points[:, 0] / points[:, 2] + centre, cols + 0.5, atol=1e-4)
     np.testing.assert_allclose(focal * points[:, 1] / points[:, 2] + centre, rows + 0.5, atol=1e-4)
+
+
+def test_depth_and_face_are_those_of_rays_against_every_triangle():
+    """Trimesh intersects the ray of each pixel centre with the plane of each triangle; the nearest hit is drawn."""
+    focal, size = 30.0, 16
+    ball = trimesh.creation.icosphere(subdivisions=1).apply_translation([0.1, -0.05, 3])
+    vertices, faces = np.asarray(ball.vertices), np.asarray(ball.faces)
+    points = np.c_[focal * vertices[:, :2] / vertices[:, 2:] + size / 2, vertices[:, 2]]
+    raster = rasterize(points, faces, size, size)
+    rows, cols = np.mgrid[:size, :size].reshape(2, -1) + 0.5
+    rays = np.c_[(cols - size / 2) / focal, (rows - size / 2) / focal, np.ones(size * size)]
+    depth, face = np.full(size * size, np.inf), np.full(size * size, -1)
+    for k, (triangle, normal) in enumerate(zip(ball.triangles, ball.face_normals, strict=True)):
+        hits, valid = trimesh.intersections.planes_lines(
+            np.repeat(triangle[:1], len(rays), 0), np.repeat(normal[None], len(rays), 0), 0 * rays, rays
+        )
+        inside = trimesh.triangles.points_to_barycentric(np.repeat(triangle[None], len(hits), 0), hits).min(1) >= 0
+        nearer = np.zeros(len(rays), bool)
+        nearer[np.flatnonzero(valid)[inside]] = hits[inside, 2] < depth[valid][inside]
+        depth[nearer], face[nearer] = hits[nearer[valid], 2], k
+    np.testing.assert_array_equal(raster.face.ravel(), face)
+    np.testing.assert_allclose(raster.depth.ravel(), depth, rtol=1e-6)
 
 
 def test_no_faces_and_unknown_back_end():
