@@ -2,7 +2,7 @@
 
     python -m ihbench.body.procedural OUT.npz
 
-writes what ships as `procedural_body.npz`. Needs scikit-image (`pip install ihbench[body]`), which reading the file
+writes what ships as `procedural_body.npz`. Building it takes scikit-image, which reading the file
 does not. Same vertex layout every time: nothing here is random.
 
 Surface: `procedural_surface.py`. Skinning weights follow from where a vertex lies between the joints. Shape

@@ -1,6 +1,6 @@
 """The surface of the procedural body: a signed distance function of smoothly joined parts, and its triangle mesh.
 
-Used only to build `procedural_body.npz` (see `procedural.py`); needs scikit-image. Metres, y up, facing +z, left hand
+Used only to build `procedural_body.npz` (see `procedural.py`), with scikit-image. Metres, y up, facing +z, left hand
 at +x, T-pose, feet at y = -0.95.
 
 The parts are stacks of superellipses (torso, arms, legs), ellipsoids and round cones (head, hands, feet). The mesh is
