@@ -8,7 +8,9 @@ from numpy.typing import NDArray
 BLOCK = 2**16  # values worked on at a time: they stay in the cache
 
 
-def rounded(image: NDArray) -> NDArray:
+def rounded(
+    image: NDArray,  # [H, W, C] or [H, W], float in [0, 1] or uint8
+) -> NDArray:
     """The nearest 8-bit image; values outside [0, 1] are clipped.
 
     A pixel that is not finite has no 8-bit value: then the image stays float, in steps of 1/255, and the pixel
@@ -17,7 +19,9 @@ def rounded(image: NDArray) -> NDArray:
     return _to_8bit(image.astype(np.float32) if image.dtype == np.float16 else image, np.rint)
 
 
-def truncated(image: NDArray) -> NDArray:
+def truncated(
+    image: NDArray,  # [H, W, C] or [H, W], float in [0, 1] or uint8
+) -> NDArray:
     """The 8-bit image that a cast makes, as HumanNeRF's `to_8b_image` does, in the image's own precision.
 
     In float32 a few of the 256 values k/255 fall one below k: a quirk of the released code that this keeps.
@@ -43,13 +47,18 @@ def _to_8bit(image: NDArray, whole: np.ufunc) -> NDArray:
     return out
 
 
-def same_type(pred: NDArray, truth: NDArray) -> tuple[NDArray, NDArray]:
+def same_type(
+    pred: NDArray,  # [H, W, C] or [H, W], float in [0, 1] or uint8
+    truth: NDArray,  # as pred
+) -> tuple[NDArray, NDArray]:
     """Two prepared images, both uint8 or both float with peak 1."""
     if (pred.dtype == np.uint8) == (truth.dtype == np.uint8):
         return pred, truth
     return as_float(pred), as_float(truth)
 
 
-def as_float(image: NDArray) -> NDArray:
+def as_float(
+    image: NDArray,  # [H, W, C] or [H, W], float in [0, 1] or uint8
+) -> NDArray:
     """The image with peak 1; uint8 becomes float64."""
     return image / 255.0 if image.dtype == np.uint8 else image

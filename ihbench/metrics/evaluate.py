@@ -58,7 +58,11 @@ class Frame:
             out |= self.truth[..., channel] != value
         return out
 
-    def all_within(self, mask: Mask, radius: int) -> bool:
+    def all_within(
+        self,
+        mask: Mask,  # [H, W]
+        radius: int,
+    ) -> bool:
         """Whether a window metric's sum over the frame is its sum over the mask, painted or not: outside the mask
         both images are background already, and no window of this radius there reaches a pixel that differs. The
         projected box of a body is such a mask as a rule."""

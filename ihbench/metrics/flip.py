@@ -89,7 +89,7 @@ def mean_flip(
     pred: NDArray,  # [H, W, 3]
     truth: NDArray,  # [H, W, 3]
     differs: Mask,  # [H, W] from `differing_pixels`; shared by all regions of a frame
-    mask: Mask | None,
+    mask: Mask | None,  # [H, W]; None is the whole frame
     background: float | tuple[float, ...] = 1.0,
     ppd: float = PPD,
 ) -> float:
@@ -271,7 +271,9 @@ def _product(matrix: NDArray[np.float64], planes: list[Plane]) -> list[Plane]:
     return [row[0] * a + row[1] * b + row[2] * c for row in matrix]
 
 
-def linear(srgb: NDArray[np.float64]) -> NDArray[np.float64]:
+def linear(
+    srgb: NDArray[np.float64],  # [...] in [0, 1]
+) -> NDArray[np.float64]:
     """sRGB in [0, 1] to linear RGB (IEC 61966-2-1)."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 

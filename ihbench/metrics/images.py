@@ -20,7 +20,13 @@ Mask = NDArray[np.bool_]  # [H, W]
 OVERSHOOT = 0.25  # of the range: what an image without a last clamp may leave it by, at either end
 
 
-def as_image(image: Any, name: str = "image", *, hdr: bool = False, data_range: float = 1.0) -> NDArray:
+def as_image(
+    image: Any,  # [H, W] or [H, W, C], float in [0, 1] or uint8
+    name: str = "image",
+    *,
+    hdr: bool = False,
+    data_range: float = 1.0,
+) -> NDArray:
     """The image as a numpy array [H, W] or [H, W, C]: uint8, float16, float32 or float64, C 1 or 3.
 
     Tensors of any device are copied to the CPU without their gradient. bfloat16, which numpy lacks, becomes float32
@@ -39,7 +45,7 @@ def as_image(image: Any, name: str = "image", *, hdr: bool = False, data_range: 
 
 
 def check_range(
-    image: NDArray,
+    image: NDArray,  # [H, W, C] or [H, W], float in [0, 1] or uint8
     name: str,
     mask: Mask | None = None,  # [H, W] the pixels that count; None is all
     *,
@@ -80,7 +86,9 @@ def range_fault(
     return f"expected floats from 0 to {data_range:g}, got {low:.4g} to {high:.4g}; {word}"
 
 
-def extent(image: NDArray) -> tuple[float, float]:
+def extent(
+    image: NDArray,  # [H, W, C] or [H, W], float in [0, 1] or uint8
+) -> tuple[float, float]:
     """The smallest and the largest finite value; (0, 0) where there is none."""
     if image.size == 0:
         return 0.0, 0.0
@@ -91,7 +99,11 @@ def extent(image: NDArray) -> tuple[float, float]:
     return low, high
 
 
-def as_mask(mask: Any, shape: tuple[int, ...], name: str = "mask") -> Mask:
+def as_mask(
+    mask: Any,  # [H, W] bool
+    shape: tuple[int, ...],
+    name: str = "mask",
+) -> Mask:
     """A mask of images [H, W, …] as a bool array [H, W]; tensors are copied to the CPU. Raises `ValueError`."""
     array = _as_numeric(mask, name)
     if array.shape == shape[:2] and array.dtype == np.bool_:
@@ -128,7 +140,12 @@ def as_background(background: Any, channels: int, data_range: float = 1.0) -> ND
     return values
 
 
-def check_images(pred: NDArray, truth: NDArray, *, mixed: bool = False) -> None:
+def check_images(
+    pred: NDArray,  # [H, W, C] or [H, W], float in [0, 1] or uint8
+    truth: NDArray,  # as pred
+    *,
+    mixed: bool = False,
+) -> None:
     """Raise `ValueError`, naming both sides, unless two images can be compared; `mixed`: one may be uint8."""
     if pred.shape != truth.shape:
         word = ""
@@ -147,7 +164,11 @@ def check_images(pred: NDArray, truth: NDArray, *, mixed: bool = False) -> None:
         )
 
 
-def check_brightness(pred: NDArray, truth: NDArray, data_range: float = 1.0) -> None:
+def check_brightness(
+    pred: NDArray,  # [H, W, C] or [H, W], float in [0, 1] or uint8
+    truth: NDArray,  # as pred
+    data_range: float = 1.0,
+) -> None:
     """Raise `ValueError` for two images of which no pixel is brighter than one 8-bit level, and neither is black.
 
     Such are divided by 255 twice, cast to uint8 before they were multiplied, or measured with another data range;
@@ -169,7 +190,12 @@ def check_brightness(pred: NDArray, truth: NDArray, data_range: float = 1.0) -> 
 
 
 def checked(
-    pred: Any, truth: Any, mask: Any = None, *, hdr: bool = False, data_range: float = 1.0
+    pred: Any,  # [H, W, C] or [H, W], float in [0, 1] or uint8
+    truth: Any,  # as pred
+    mask: Any = None,  # [H, W] bool; None is the whole frame
+    *,
+    hdr: bool = False,
+    data_range: float = 1.0,
 ) -> tuple[NDArray, NDArray, Mask | None]:
     """Two images and a mask as numpy arrays that can be compared. Raises `ValueError` otherwise."""
     pred, truth = as_image(pred, "pred", hdr=True), as_image(truth, "truth", hdr=True)
@@ -244,7 +270,10 @@ def peak_of(dtype: np.dtype) -> float:
     return 255.0 if dtype == np.uint8 else 1.0
 
 
-def differing_pixels(pred: NDArray, truth: NDArray) -> Mask:
+def differing_pixels(
+    pred: NDArray,  # [H, W, C] or [H, W], float in [0, 1] or uint8
+    truth: NDArray,  # as pred
+) -> Mask:
     """[H, W] True where the images differ in any channel, or hold something that is not finite."""
     values = pred != truth
     if pred.dtype != np.uint8:
@@ -257,7 +286,9 @@ def differing_pixels(pred: NDArray, truth: NDArray) -> Mask:
     return out
 
 
-def bounds(mask: Mask) -> tuple[slice, slice] | None:
+def bounds(
+    mask: Mask,  # [H, W]
+) -> tuple[slice, slice] | None:
     """Rows and columns of the smallest rectangle that holds every True pixel; None without any."""
     rows = np.flatnonzero(mask.any(1))
     if len(rows) == 0:

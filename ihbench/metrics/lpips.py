@@ -80,7 +80,9 @@ def lpips(
     return 0.0 if np.array_equal(x, y) else network.distance(padded(x), padded(y), feed)
 
 
-def padded(image: NDArray) -> NDArray:
+def padded(
+    image: NDArray,  # [H, W, 3]
+) -> NDArray:
     """[H, W, 3] the image, grey to the right and below where it is smaller than `MIN_SIDE`."""
     short = [max(0, MIN_SIDE - side) for side in image.shape[:2]]
     if not any(short):
@@ -107,7 +109,13 @@ class Network:
     net: str
     package: Any  # lpips.LPIPS, in evaluation mode
 
-    def distance(self, pred: NDArray, truth: NDArray, feed: str, tile: int = TILE) -> float:
+    def distance(
+        self,
+        pred: NDArray,  # [H, W, 3] float in [0, 1] or uint8
+        truth: NDArray,  # as pred
+        feed: str,
+        tile: int = TILE,
+    ) -> float:
         """LPIPS of two finite images [H, W, 3] in [0, 1], at least `MIN_SIDE` on each side, in tiles of `tile` px (a
         multiple of every stride)."""
         import torch

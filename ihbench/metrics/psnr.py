@@ -32,7 +32,13 @@ def psnr(
     return SquaredError.of(pred, truth, differing_pixels(pred, truth)).pooled(mask)
 
 
-def mean_of_channels(pred: Any, truth: Any, mask: Any = None, *, hdr: bool = False) -> float:
+def mean_of_channels(
+    pred: Any,  # [H, W, C] or [H, W], float in [0, 1] or uint8
+    truth: Any,  # as pred
+    mask: Any = None,  # [H, W]; None is the whole frame
+    *,
+    hdr: bool = False,
+) -> float:
     """The mean of the channels' own PSNRs, the habit of code descended from 3D Gaussian splatting.
 
     One channel without any error makes it inf. Otherwise as `psnr`.
@@ -56,7 +62,12 @@ class SquaredError:
     peak: float
 
     @classmethod
-    def of(cls, pred: NDArray, truth: NDArray, differs: Mask) -> SquaredError:
+    def of(
+        cls,
+        pred: NDArray,  # [H, W, C] or [H, W], float in [0, 1] or uint8
+        truth: NDArray,  # as pred
+        differs: Mask,  # [H, W] from `differing_pixels`
+    ) -> SquaredError:
         """From images already checked and `differing_pixels` of them."""
         rows, columns = bounds(differs) or (slice(0, 0), slice(0, 0))
         channels = pred.shape[2] if pred.ndim == 3 else 1
@@ -72,7 +83,10 @@ class SquaredError:
                     np.multiply(out, out, out=out)
         return cls(values, rows, columns, differs.size, peak_of(pred.dtype))
 
-    def means(self, mask: Mask | None) -> list[float]:
+    def means(
+        self,
+        mask: Mask | None,  # [H, W]; None is the whole frame
+    ) -> list[float]:
         """The mean squared error of every channel over the mask, for a peak of 1; NaN where there is none."""
         pixels = self.pixels if mask is None else int(np.count_nonzero(mask))
         if pixels == 0:
@@ -92,12 +106,18 @@ class SquaredError:
         means = [total / pixels / self.peak**2 for total in totals]
         return [mean if math.isfinite(mean) else math.nan for mean in means]
 
-    def pooled(self, mask: Mask | None) -> float:
+    def pooled(
+        self,
+        mask: Mask | None,  # [H, W]; None is the whole frame
+    ) -> float:
         """PSNR of the mean over all channels."""
         means = self.means(mask)
         return decibels(math.fsum(means) / len(means)) if means else math.nan
 
-    def mean_of_channels(self, mask: Mask | None) -> float:
+    def mean_of_channels(
+        self,
+        mask: Mask | None,  # [H, W]; None is the whole frame
+    ) -> float:
         """The mean of the channels' PSNRs."""
         values = [decibels(mean) for mean in self.means(mask)]
         return sum(values) / len(values) if values else math.nan

@@ -109,10 +109,10 @@ def ssim(
 
 
 def mean_ssim(
-    pred: NDArray,
-    truth: NDArray,
+    pred: NDArray,  # [H, W, C] or [H, W], float in [0, 1] or uint8
+    truth: NDArray,  # as pred
     differs: Mask,  # [H, W] from `differing_pixels`; shared by all regions of a frame
-    mask: Mask | None,
+    mask: Mask | None,  # [H, W]; None is the whole frame
     window: Window = HEADLINE,
     background: float | tuple[float, ...] | None = 1.0,
 ) -> float:

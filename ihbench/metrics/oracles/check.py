@@ -230,7 +230,12 @@ def _as_torch(image: NDArray) -> Any:
 # LPIPS
 
 
-def package_distance(package: Any, feed: str, pred: NDArray, truth: NDArray) -> float:
+def package_distance(
+    package: Any,
+    feed: str,
+    pred: NDArray,  # [H, W, 3] float in [0, 1] or uint8
+    truth: NDArray,  # as pred
+) -> float:
     """What the `lpips` package itself says of two images [H, W, 3] in [0, 1]; small ones padded as ours are."""
     import torch
 

@@ -41,7 +41,11 @@ def flip_oracle(
     return math.fsum(inside) / len(inside) if len(inside) else math.nan
 
 
-def flip_map_oracle(pred: NDArray, truth: NDArray, ppd: float = DEFAULT_PPD) -> NDArray[np.float64]:
+def flip_map_oracle(
+    pred: NDArray,  # [H, W, 3] float in [0, 1] or uint8
+    truth: NDArray,  # as pred
+    ppd: float = DEFAULT_PPD,
+) -> NDArray[np.float64]:
     """[H, W] FLIP of two finite images [H, W, 3]."""
     x, y = (_opponent(np.clip(_unit(image), 0, 1)) for image in (pred, truth))
     color = _color_difference(_lab_with_hunt(_blurred(x, ppd)), _lab_with_hunt(_blurred(y, ppd)))

@@ -10,7 +10,11 @@ from numpy.typing import NDArray
 EDGES = {"mirror": "symmetric", "reflect": "reflect", "zero": "constant"}  # what numpy calls them
 
 
-def psnr_oracle(pred: NDArray, truth: NDArray, mask: NDArray[np.bool_] | None = None) -> float:
+def psnr_oracle(
+    pred: NDArray,  # [H, W, C] or [H, W], float in [0, 1] or uint8
+    truth: NDArray,  # as pred
+    mask: NDArray[np.bool_] | None = None,  # [H, W]; None is the whole frame
+) -> float:
     """PSNR in dB of [H, W, C] images, float with peak 1 or uint8; exactly rounded sums."""
     pred, truth = _unit(pred), _unit(truth)
     errors = []
@@ -23,7 +27,11 @@ def psnr_oracle(pred: NDArray, truth: NDArray, mask: NDArray[np.bool_] | None = 
     return math.inf if mse == 0 else -10 * math.log10(mse)
 
 
-def psnr_channels_oracle(pred: NDArray, truth: NDArray, mask: NDArray[np.bool_] | None = None) -> float:
+def psnr_channels_oracle(
+    pred: NDArray,  # [H, W, C] or [H, W], float in [0, 1] or uint8
+    truth: NDArray,  # as pred
+    mask: NDArray[np.bool_] | None = None,  # [H, W]; None is the whole frame
+) -> float:
     """The mean of the channels' PSNRs in dB."""
     values = [psnr_oracle(pred[..., c : c + 1], truth[..., c : c + 1], mask) for c in range(pred.shape[2])]
     return math.fsum(values) / len(values) if all(map(math.isfinite, values)) else sum(values)
@@ -63,8 +71,8 @@ def ssim_oracle(
 
 
 def ssim_map_oracle(
-    pred: NDArray,
-    truth: NDArray,
+    pred: NDArray,  # [H, W, C] or [H, W], float in [0, 1] or uint8
+    truth: NDArray,  # as pred
     *,
     window: int = 11,
     sigma: float | None = 1.5,

@@ -24,7 +24,12 @@ UNIFORM = {"window": 7, "sigma": None, "sample": True, "data_range": 2.0}  # sci
 
 
 def preset_oracle(
-    name: str, pred: NDArray, truth: NDArray, masks: Masks, background: tuple[float, float, float], lpips: Distance
+    name: str,
+    pred: NDArray,  # [H, W, 3] float in [0, 1] or uint8
+    truth: NDArray,  # as pred
+    masks: Masks,  # name -> [H, W]
+    background: tuple[float, float, float],
+    lpips: Distance,
 ) -> dict[str, float]:
     """Identity string -> value, for the named preset over regions whose masks are given (`full` always is)."""
     return ORACLES[name](pred, truth, masks, np.asarray(background, np.float64), lpips)
