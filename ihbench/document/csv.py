@@ -1,97 +1,107 @@
-"""A paper's table for programs: CSV with one line for each cell, and JSON."""
+"""The tables of a document for programs: CSV, and plain data for JSON."""
 
 from __future__ import annotations
 
 import csv
 import io
-import json
 import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
-from ihbench.document.diagram import harmless
-from ihbench.files import atomic
-from ihbench.reports.paper.paper_table import Block, Cell, Frame, Row
+from ihbench.document.document import Block, Column, Heading, Number, Table, plain_text
+from ihbench.errors import visible
 
-FIELDS: tuple[str, ...] = (
-    "table", "block", "kind", "row", "section", "calibration", "group", "metric", "unit", "text", "value", "low",
-    "high", "scenes", "status", "mark", "reason", "identity", "footnotes",
-)  # fmt: skip
+FORMULA = ("=", "+", "-", "@", "\t", "\r")  # what a spreadsheet runs
 
 
-def write_csv(frame: Frame) -> str:
-    """One line for each cell. Absent numbers are empty; footnotes are in words."""
+def write(blocks: Sequence[Block], folder: Path = Path(".")) -> str:
+    """The rows of every table under its head; where there are several, the first column names the heading or title
+    that each stands under, and an empty line is between two."""
     out = io.StringIO()
-    lines = csv.DictWriter(out, FIELDS, lineterminator="\n")
-    lines.writeheader()
-    for block in frame.blocks:
-        for row in block.rows:
-            for column, cell in zip(block.columns, row.cells, strict=True):
-                about = {
-                    "table": frame.name,
-                    "block": block.title,
-                    "kind": block.kind,
-                    "row": row.label,
-                    "section": row.section,
-                    "calibration": "yes" if row.calibration else "no",
-                    "group": column.group,
-                    "metric": column.metric.title,
-                    "unit": column.metric.unit,
-                    **{key: _csv_value(value) for key, value in _cell(frame, cell).items()},
-                }
-                lines.writerow({key: harmless(value) for key, value in about.items()})
+    lines = csv.writer(out, lineterminator="\n")
+    several, under = sum(isinstance(block, Table) for block in blocks) > 1, ""
+    begun = False
+    for block in blocks:
+        if isinstance(block, Heading):
+            under = block.text
+        elif isinstance(block, Table):
+            out.write("\n" * begun)
+            begun = True
+            for first, row in (("table", block.head), *((block.title or under, row) for row in block.rows)):
+                cells = [*([first] if several else []), *map(plain_text, row)]
+                lines.writerow([harmless(cell) for cell in cells])
     return out.getvalue()
 
 
-def write_json(frame: Frame) -> str:
-    """Strict JSON; numbers that are not finite are strings, as in every file of this bench."""
-    content = {
-        "table": frame.name,
-        "title": frame.title,
-        "source": frame.source,
-        "blocks": [_block(frame, block) for block in frame.blocks],
-        "footnotes": dict(frame.footnotes),
-        "notes": list(frame.notes),
-    }
-    return json.dumps(atomic.encode(content), indent=1) + "\n"
+def write_cells(about: Mapping[str, str], tables: Sequence[Table], footnotes: Mapping[str, str]) -> str:
+    """One line for each number of the tables: `about` all of them, its row and column, and what it is worth. Absent
+    numbers are empty; footnotes are in words."""
+    rows = [{**about, **cell} for table in tables for cell in _cells(table, footnotes)]
+    out = io.StringIO()
+    lines = csv.DictWriter(out, list(rows[0]) if rows else [*about], lineterminator="\n")
+    lines.writeheader()
+    lines.writerows({key: harmless(_csv_value(value)) for key, value in row.items()} for row in rows)
+    return out.getvalue()
 
 
-def _block(frame: Frame, block: Block) -> dict[str, Any]:
+def _cells(table: Table, footnotes: Mapping[str, str]) -> Iterator[dict[str, Any]]:
+    columns = [cell for cell in table.head if isinstance(cell, Column)]
+    for k, label in enumerate(table.labels):
+        for column, number in zip(columns, table.numbers(k), strict=True):
+            yield {
+                "block": table.title,
+                "kind": table.kind,
+                "row": label.name,
+                "section": label.section,
+                "calibration": "yes" if label.bound else "no",
+                "group": column.group,
+                "metric": column.metric.title,
+                "unit": column.metric.unit,
+                **_number(number, footnotes),
+            }
+
+
+def table_data(table: Table, footnotes: Mapping[str, str]) -> dict[str, Any]:
+    """A table of numbers as plain data."""
+    head = [plain_text(cell) for cell in table.head]
+    ticks = slice(table.left, table.left + table.ticks)
+    columns = [cell for cell in table.head if isinstance(cell, Column)]
     return {
-        "title": block.title,
-        "kind": block.kind,
-        "components": list(block.components),
+        "title": table.title,
+        "kind": table.kind,
+        "components": head[ticks],
         "columns": [
             {"group": c.group, "metric": c.key, "title": c.title, "higher_is_better": c.metric.higher_is_better}
-            for c in block.columns
+            for c in columns
         ],
-        "rows": [_row(frame, row) for row in block.rows],
-        "notes": list(block.notes),
+        "rows": [
+            {
+                "row": label.name,
+                "section": label.section,
+                "status": plain_text(table.rows[k][1]),
+                "calibration": label.bound,
+                "components": [plain_text(cell) for cell in table.rows[k][ticks]],
+                "cells": [_number(number, footnotes) for number in table.numbers(k)],
+            }
+            for k, label in enumerate(table.labels)
+        ],
+        "notes": list(table.notes),
     }
 
 
-def _row(frame: Frame, row: Row) -> dict[str, Any]:
+def _number(number: Number, footnotes: Mapping[str, str]) -> dict[str, Any]:
     return {
-        "row": row.label,
-        "section": row.section,
-        "status": row.status,
-        "calibration": row.calibration,
-        "components": list(row.components),
-        "cells": [_cell(frame, cell) for cell in row.cells],
-    }
-
-
-def _cell(frame: Frame, cell: Cell) -> dict[str, Any]:
-    return {
-        "text": cell.text,
-        "value": cell.value,
-        "low": cell.low,
-        "high": cell.high,
-        "scenes": cell.scenes,
-        "status": cell.status,
-        "mark": cell.mark,
-        "reason": cell.reason,
-        "identity": cell.identity,
-        "footnotes": [frame.footnotes[letter] for letter in cell.footnotes],
+        "text": f"{number.text} {number.interval}".rstrip(),
+        "value": number.value,
+        "low": number.low,
+        "high": number.high,
+        "scenes": number.scenes,
+        "status": number.status,
+        "mark": number.mark,
+        "reason": number.reason,
+        "identity": number.identity,
+        "footnotes": [footnotes[letter] for letter in number.footnotes],
     }
 
 
@@ -99,3 +109,15 @@ def _csv_value(value: Any) -> Any:
     if isinstance(value, float):
         return "" if math.isnan(value) else repr(value)
     return " | ".join(value) if isinstance(value, list) else value
+
+
+def harmless(value: Any) -> Any:
+    """A CSV's cell. Names from elsewhere must not become formulas in a spreadsheet; numbers may be negative."""
+    if not isinstance(value, str):
+        return value
+    try:
+        float(value)
+    except ValueError:
+        shown = visible(value, keep="\n")
+        return "'" + shown if value.startswith(FORMULA) else shown
+    return value

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ihbench.document.csv import harmless
 from ihbench.errors import visible
 
 if TYPE_CHECKING:
@@ -44,7 +45,6 @@ STYLE: Any = {  # as matplotlib names them
 DPI = 150
 TICKS_1 = (1, 2, 3, 4, 5, 6, 7, 8, 9)
 APART = 7.0  # px between a label and a point
-FORMULA = ("=", "+", "-", "@", "\t", "\r")  # what a spreadsheet runs
 LETTER = 0.6  # mean width of a letter over the font's size
 
 
@@ -104,18 +104,6 @@ def _cell(value: Any) -> Any:
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return ""
     return repr(value) if isinstance(value, float) else harmless(value)
-
-
-def harmless(value: Any) -> Any:
-    """A CSV's cell. Names from elsewhere must not become formulas in a spreadsheet; numbers may be negative."""
-    if not isinstance(value, str):
-        return value
-    try:
-        float(value)
-    except ValueError:
-        shown = visible(value, keep="\n")
-        return "'" + shown if value.startswith(FORMULA) else shown
-    return value
 
 
 def logarithmic(axes: Axes, x: Sequence[float], y: Sequence[float]) -> None:

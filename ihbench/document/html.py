@@ -1,4 +1,4 @@
-"""The general report as one HTML file: pictures are inside, text is escaped, nothing is fetched and nothing runs."""
+"""A document as one HTML file: pictures are inside, text is escaped, nothing is fetched and nothing runs."""
 
 from __future__ import annotations
 
@@ -6,18 +6,14 @@ import html
 from base64 import b64encode
 from collections.abc import Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
-from ihbench.document.document import Block, Bullets, Heading, Paragraph, Picture, Table, Words, spans
+from ihbench.document.document import Block, Bullets, Cell, Column, Heading, Number, Paragraph, Picture, Table, spans
 from ihbench.errors import visible
-from ihbench.record.quality_time import Target
-from ihbench.record.results import RunResult
-from ihbench.reports.general.content import general_report, score_tables
-from ihbench.reports.general.figures import draw
-from ihbench.reports.general.run_pictures import run_pictures
-from ihbench.reports.general.short_names import LONG, with_short_names
 
-TAGS = {"strong": "strong", "emphasis": "em", "code": "code", "raised": "sup"}
+STYLES = {
+    "strong": "<strong>{}</strong>", "emphasis": "<em>{}</em>", "code": "<code>{}</code>", "raised": "<sup>{}</sup>",
+    "underlined": "<u>{}</u>", "small": '<span class="interval">{}</span>',
+}  # fmt: skip
 # even if something slipped through the escaping, a browser that obeys this neither runs it nor loads anything
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; form-action 'none'; base-uri 'none'"
 STYLE = """
@@ -33,39 +29,18 @@ td.left:first-child { min-width: 11rem; }
 code { background: #f3f3f3; padding: 0 .2em; }
 img { max-width: 100%; height: auto; }
 figure { margin: 1.5rem 0; } figcaption { color: #444; }
+section { margin: 2rem 0; padding: .2rem 1rem; border-left: 5px solid #888; }
+section.quoted { border-color: #777; } section.real-data { border-color: #1b7837; }
+section.stand-in { border-color: #b35806; background: #fff7ec; }
+th.group { text-align: center; } tr.section td { border-top: 1px solid #bbb; }
+tr.bound { color: #666; } td.absent { color: #888; } td.unreliable { color: #a00; }
+.interval { color: #555; font-size: 85%; } sup { font-size: 70%; line-height: 0; }
 """
 
 
-def write(
-    results: Sequence[RunResult],
-    presets: Sequence[str] = (),
-    *,
-    targets: Sequence[Target] = (),
-    pictures: Sequence[tuple[Path, str]] = (),  # file, caption
-    folder: Path = Path("."),  # where the text will lie; this report needs nothing beside it
-    left_out: Sequence[str] = (),  # folders, with the reasons
-    fragment: bool = False,  # the tables of scores alone, without a document around them
-) -> str:
-    """The report of these runs; see `general_report`. The runs' own pictures are in it, and diagrams: the ones given,
-    else its own."""
-    if fragment:
-        return fragments(results, presets)
-    own = run_pictures(results)
-    if pictures:
-        return page(with_short_names(general_report(results, presets, targets, [*pictures, *own], left_out), LONG))
-    with TemporaryDirectory() as name:
-        drawn = [*draw(results, Path(name)), *own]
-        return page(with_short_names(general_report(results, presets, targets, drawn, left_out), LONG))
-
-
-def fragments(results: Sequence[RunResult], presets: Sequence[str] = ()) -> str:
-    """The tables of scores alone, without a page around them."""
-    tables = with_short_names([table for _, table in score_tables(results, presets)], LONG)
-    return "\n".join(map(_block, tables)) + "\n"
-
-
-def page(blocks: Sequence[Block], title: str = "ihbench report") -> str:
-    """A whole document of some blocks."""
+def write(blocks: Sequence[Block], folder: Path = Path(".")) -> str:
+    """A whole page of some blocks; it needs nothing beside it."""
+    title = next((b.text for b in blocks if isinstance(b, Heading) and b.level == 1), "ihbench report")
     return "\n".join(
         [
             "<!DOCTYPE html>",
@@ -74,10 +49,16 @@ def page(blocks: Sequence[Block], title: str = "ihbench report") -> str:
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
             f"<title>{escape(title)}</title><style>{STYLE}</style></head><body>",
             f"<h1>{escape(title)}</h1>",
-            *(_block(block) for block in blocks),
+            *(_block(block) for block in blocks if not isinstance(block, Heading) or block.level > 1),
             "</body></html>\n",
         ]
     )
+
+
+def fragment(blocks: Sequence[Block]) -> str:
+    """The tables alone, and the paragraphs that say what their letters mean, without a page around them."""
+    kept = [_table(b) if isinstance(b, Table) else _block(b) for b in blocks if not isinstance(b, Heading)]
+    return "\n".join(kept) + "\n"
 
 
 def escape(text: str) -> str:
@@ -93,8 +74,12 @@ def _block(block: Block) -> str:
             return f"<p>{_words(words)}</p>"
         case Bullets(items):
             return "<ul>" + "".join(f"<li>{_words(item)}</li>" for item in items) + "</ul>"
-        case Table():
+        case Table(title=""):
             return _table(block)
+        case Table():
+            notes = "".join(f"<li>{escape(note)}</li>" for note in block.notes)
+            opened = f'<section class="{block.kind.replace(" ", "-")}"><h2>{escape(block.title)}</h2>'
+            return f"{opened}\n{_table(block)}\n<ul>{notes}</ul></section>"
         case Picture(png, caption):
             data = b64encode(png.read_bytes()).decode("ascii")
             image = f'<img alt="{escape(caption)}" src="data:image/png;base64,{data}">'
@@ -103,19 +88,29 @@ def _block(block: Block) -> str:
 
 
 def _table(table: Table) -> str:
-    def row(cells: Sequence[Words], tag: str) -> str:
-        opened = [f'<{tag} class="left">' if k < table.left else f"<{tag}>" for k in range(len(cells))]
-        shown = (f"{begin}{_words(cell)}</{tag}>" for begin, cell in zip(opened, cells, strict=True))
-        return f"<tr>{''.join(shown)}</tr>"
+    words = table.left + table.ticks
+    groups = "".join(f'<th class="group" colspan="{n}">{escape(name)}</th>' for name, n in table.groups.items())
+    head = f'<tr><th colspan="{words}"></th>{groups}</tr>' if groups else ""
+    titles = [cell.title if isinstance(cell, Column) else cell for cell in table.head]
+    head += f"<tr>{''.join(_cell(cell, k < words, 'th') for k, cell in enumerate(titles))}</tr>"
+    rows = []
+    for k, row in enumerate(table.rows):
+        kinds = ["section"] * table.begins_section(k) + ["bound"] * (bool(table.labels) and table.labels[k].bound)
+        opened = f'<tr class="{" ".join(kinds)}">' if kinds else "<tr>"
+        rows.append(f"{opened}{''.join(_cell(cell, k < words) for k, cell in enumerate(row))}</tr>")
+    return f'<div class="wide"><table><thead>{head}</thead><tbody>{"".join(rows)}</tbody></table></div>'
 
-    body = "".join(row(cells, "td") for cells in table.rows)
-    return f'<div class="wide"><table><thead>{row(table.head, "th")}</thead><tbody>{body}</tbody></table></div>'
+
+def _cell(cell: Cell, left: bool, tag: str = "td") -> str:
+    about = ' class="left"' if left else ""
+    if isinstance(cell, Number):
+        why = f"{cell.status}: {cell.reason}" if cell.reason else f"{cell.status} {cell.identity}".rstrip()
+        about = f' class="{cell.status}" title="{escape(why)}"'
+    return f"<{tag}{about}>{_words(cell)}</{tag}>"
 
 
-def _words(words: Words) -> str:
+def _words(words: Cell) -> str:
     return "".join(
-        escape(piece)
-        if isinstance(piece, str)
-        else f"<{TAGS[piece.style]}>{escape(piece.text)}</{TAGS[piece.style]}>"
+        escape(piece) if isinstance(piece, str) else STYLES[piece.style].format(escape(piece.text))
         for piece in spans(words)
     )

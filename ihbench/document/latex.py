@@ -1,4 +1,4 @@
-"""The general report in LaTeX: one document that pdflatex compiles, tables with booktabs' rules."""
+"""A document in LaTeX, which pdflatex compiles, tables with booktabs' rules."""
 
 from __future__ import annotations
 
@@ -6,12 +6,8 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from ihbench.document.document import Block, Bullets, Heading, Paragraph, Picture, Table, Words, spans
+from ihbench.document.document import Block, Bullets, Cell, Column, Heading, Paragraph, Picture, Table, spans
 from ihbench.errors import visible
-from ihbench.record.quality_time import Target
-from ihbench.record.results import RunResult
-from ihbench.reports.general.content import general_report, score_tables
-from ihbench.reports.general.short_names import with_short_names
 
 PREAMBLE = r"""\documentclass[10pt]{article}
 \usepackage[T1]{fontenc}
@@ -31,47 +27,33 @@ SPECIAL = {
     "↑": r"$\uparrow$", "↓": r"$\downarrow$", "→": r"$\rightarrow$", "×": r"$\times$", "±": r"$\pm$",
     "−": r"$-$", "∞": r"$\infty$", "≤": r"$\leq$", "≥": r"$\geq$", "≈": r"$\approx$", "°": r"\textdegree{}",
     "²": r"\textsuperscript{2}", "³": r"\textsuperscript{3}", "µ": r"\textmu{}", "Δ": r"$\Delta$", "β": r"$\beta$",
-    "†": r"\textdagger{}", "‡": r"\textdaggerdbl{}", "§": r"\S{}",
+    "✓": r"$\surd$", "†": r"\textdagger{}", "‡": r"\textdaggerdbl{}", "§": r"\S{}",
 }  # fmt: skip
 NEEDS = r"% a fragment for \input: needs \usepackage{booktabs}, \usepackage{textcomp} and, in pdflatex, T1 fonts"
-STYLES = {"strong": r"\textbf", "emphasis": r"\emph", "code": r"\texttt", "raised": r"\textsuperscript"}
+STYLES = {
+    "strong": r"\textbf{%s}", "emphasis": r"\emph{%s}", "code": r"\texttt{%s}", "raised": r"\textsuperscript{%s}",
+    "underlined": r"\underline{%s}", "small": r"{\scriptsize %s}",
+}  # fmt: skip
 LATIN = 0x17F  # the last letter that T1 fonts have
+PAIRED = "% ihbench lint: paired"  # tells the linter that marks come from paired differences
 
 
-def write(
-    results: Sequence[RunResult],
-    presets: Sequence[str] = (),
-    *,
-    targets: Sequence[Target] = (),
-    pictures: Sequence[tuple[Path, str]] = (),  # file, caption
-    folder: Path = Path("."),  # where the text will lie
-    left_out: Sequence[str] = (),  # folders, with the reasons
-    fragment: bool = False,  # the tables of scores alone, without a document around them
-) -> str:
-    """The report of these runs; see `general_report`. Row names are short, their switches stand below."""
-    if fragment:
-        return fragments(results, presets)
-    return latex(with_short_names(general_report(results, presets, targets, pictures, left_out)), folder)
-
-
-def fragments(results: Sequence[RunResult], presets: Sequence[str] = ()) -> str:
-    """The tabulars alone, to be taken into somebody's document with \\input; it needs booktabs. What belongs below a
-    table stands in comments."""
-    lines = [NEEDS]
-    for title, table in score_tables(results, presets):
-        lines.append(f"% {_comment(title)}")
-        for block in with_short_names([table]):
-            lines.append(_tabular(block) if isinstance(block, Table) else f"% below it: {_block(block, Path())}")
-    return "\n".join(lines) + "\n"
-
-
-def _comment(text: str) -> str:
-    return " ".join(visible(text).split())
-
-
-def latex(blocks: Sequence[Block], folder: Path = Path(".")) -> str:
-    """A whole document of some blocks."""
+def write(blocks: Sequence[Block], folder: Path = Path(".")) -> str:
+    """A whole document of some blocks; a table with a title is a table environment with its notes."""
     return PREAMBLE + "\n\n".join(_block(block, folder) for block in blocks) + "\n\\end{document}\n"
+
+
+def fragment(blocks: Sequence[Block]) -> str:
+    """The tabulars alone, to be taken into somebody's document with \\input; it needs booktabs. What belongs below
+    a table stands in comments."""
+    lines = [NEEDS]
+    for block in blocks:
+        if isinstance(block, Table):
+            lines += [f"% {' '.join(visible(block.title).split())}"] if block.title else []
+            lines += [*([PAIRED] if block.paired else []), _tabular(block)]
+        elif not isinstance(block, Heading):
+            lines.append(f"% {_block(block, Path())}")
+    return "\n".join(lines) + "\n"
 
 
 def escape(text: str) -> str:
@@ -94,7 +76,7 @@ def _block(block: Block, folder: Path) -> str:
                 [r"\begin{itemize}", *(rf"\item {{}}{_words(item)}" for item in items), r"\end{itemize}"]
             )
         case Table():
-            return _table(block)
+            return _environment(block) if block.title else rf"\fitted{{{_tabular(block)}}}"
         case Picture(png, caption):
             where = Path(os.path.relpath(png, folder)).as_posix()
             return (
@@ -104,19 +86,47 @@ def _block(block: Block, folder: Path) -> str:
     raise TypeError(f"report: expected a block of document.py, got {type(block).__name__}")
 
 
-def _table(table: Table) -> str:
-    return rf"\fitted{{{_tabular(table)}}}"
+def _environment(table: Table) -> str:
+    notes = [rf"\par {escape(note)}" for note in table.notes]
+    lines = [
+        *([PAIRED] if table.paired else []),
+        r"\begin{table}[!htbp]",
+        r"\centering\footnotesize",
+        rf"\caption{{{escape(table.title)}.}}",
+        *([rf"\label{{tab:{table.name}}}"] if table.name else []),
+        rf"\par\smallskip\fitted{{{_tabular(table)}}}",
+        *([r"\par\medskip\begin{minipage}{\linewidth}\footnotesize\raggedright"] if notes else []),
+        *notes,
+        *([r"\end{minipage}"] if notes else []),
+        r"\end{table}",
+    ]
+    return "\n".join(lines)
 
 
 def _tabular(table: Table) -> str:
-    columns = "l" * table.left + "r" * (len(table.head) - table.left)
-    rows = [" & ".join(_words(cell) for cell in row) + r" \\" for row in (table.head, *table.rows)]
-    body = "\n".join([r"\toprule", rows[0], r"\midrule", *rows[1:], r"\bottomrule"])
-    return rf"\begin{{tabular}}{{{columns}}}" + f"\n{body}\n" + r"\end{tabular}"
+    words = table.left + table.ticks
+    spec = "l" * table.left + "c" * table.ticks + "r" * (len(table.head) - words)
+    groups, rules, at = [], [], words + 1
+    for name, width in table.groups.items():
+        groups.append(rf"\multicolumn{{{width}}}{{c}}{{{escape(name)}}}")
+        rules.append(rf"\cmidrule(lr){{{at}-{at + width - 1}}}")
+        at += width
+    lines = [rf"\begin{{tabular}}{{{spec}}}", r"\toprule"]
+    lines += [" & " * words + " & ".join(groups) + r" \\", " ".join(rules)] if groups else []
+    lines += [_row([cell.title if isinstance(cell, Column) else cell for cell in table.head]), r"\midrule"]
+    for k, row in enumerate(table.rows):
+        lines += [*([r"\midrule"] if table.begins_section(k) else []), _row(row)]
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"])
 
 
-def _words(words: Words) -> str:
+def _row(cells: Sequence[Cell]) -> str:
+    row = " & ".join(map(_words, cells)) + r" \\"
+    # after the \\ of the row above, a bracket or a star would be taken for its argument
+    return ("{}" if row[:1] in "[*" else "") + row
+
+
+def _words(words: Cell) -> str:
     return "".join(
-        escape(piece) if isinstance(piece, str) else f"{STYLES[piece.style]}{{{escape(piece.text)}}}"
+        escape(piece) if isinstance(piece, str) else STYLES[piece.style] % escape(piece.text)
         for piece in spans(words)
     )

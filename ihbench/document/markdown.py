@@ -1,4 +1,4 @@
-"""The general report in Markdown; it also goes to a terminal."""
+"""A document in Markdown (GitHub's): best numbers bold, second-best ones underlined."""
 
 from __future__ import annotations
 
@@ -8,40 +8,25 @@ from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import quote
 
-from ihbench.document.document import Block, Bullets, Heading, Paragraph, Picture, Table, Words, spans
+from ihbench.document.document import Block, Bullets, Cell, Heading, Paragraph, Picture, Span, Table, spans
 from ihbench.errors import visible
-from ihbench.record.quality_time import Target
-from ihbench.record.results import RunResult
-from ihbench.reports.general.content import general_report, score_tables
-from ihbench.reports.general.short_names import LONG, with_short_names
 
-MARKS = {"strong": "**", "emphasis": "*", "code": "`"}
-
-
-def write(
-    results: Sequence[RunResult],
-    presets: Sequence[str] = (),
-    *,
-    targets: Sequence[Target] = (),
-    pictures: Sequence[tuple[Path, str]] = (),  # file, caption
-    folder: Path = Path("."),  # where the text will lie
-    left_out: Sequence[str] = (),  # folders, with the reasons
-    fragment: bool = False,  # the tables of scores alone, without a document around them
-) -> str:
-    """The report of these runs; see `general_report`."""
-    if fragment:
-        return fragments(results, presets)
-    return markdown(with_short_names(general_report(results, presets, targets, pictures, left_out), LONG), folder)
+STYLES = {
+    "strong": "**{}**", "emphasis": "*{}*", "code": "`{}`", "raised": "<sup>{}</sup>", "underlined": "<u>{}</u>",
+    "small": "{}",
+}  # fmt: skip
+PAIRED = "<!-- ihbench lint: paired -->"  # tells the linter that marks come from paired differences
 
 
-def fragments(results: Sequence[RunResult], presets: Sequence[str] = ()) -> str:
-    """The tables of scores alone."""
-    return markdown(with_short_names([table for _, table in score_tables(results, presets)], LONG))
-
-
-def markdown(blocks: Sequence[Block], folder: Path = Path(".")) -> str:
+def write(blocks: Sequence[Block], folder: Path = Path(".")) -> str:
     """The text of some blocks, with a blank line between two."""
     return "\n\n".join(_block(block, folder) for block in blocks) + "\n"
+
+
+def fragment(blocks: Sequence[Block]) -> str:
+    """The tables alone, and the paragraphs that say what their letters mean."""
+    kept = [_table(b) if isinstance(b, Table) else _block(b, Path()) for b in blocks if not isinstance(b, Heading)]
+    return "\n\n".join(kept) + "\n"
 
 
 def _block(block: Block, folder: Path) -> str:
@@ -53,26 +38,29 @@ def _block(block: Block, folder: Path) -> str:
         case Bullets(items):
             return "\n".join(f"- {_line(item)}" for item in items)
         case Table():
-            rule = "---|" * block.left + "---:|" * (len(block.head) - block.left)
-            rows = ["| " + " | ".join(_words(cell) for cell in row) + " |" for row in (block.head, *block.rows)]
-            return "\n".join([rows[0], f"|{rule}", *rows[1:]])
+            title = f"### {plain(block.title)}\n\n" if block.title else ""
+            notes = "\n".join(f"- {_line(note)}" for note in block.notes)
+            return title + _table(block) + (f"\n\n{notes}" if notes else "")
         case Picture(png, caption):
             where = Path(os.path.relpath(png, folder)).as_posix()
             return f"![{plain(caption).replace(']', '')}](<{quote(where, safe='/@+=,~')}>)\n\n{plain(caption)}"
     raise TypeError(f"report: expected a block of document.py, got {type(block).__name__}")
 
 
-def _words(words: Words) -> str:
+def _table(table: Table) -> str:
+    numbers = len(table.head) - table.left - table.ticks
+    rule = "|" + "---|" * table.left + ":---:|" * table.ticks + "---:|" * numbers
+    head, *rows = ("| " + " | ".join(map(_words, row)) + " |" for row in (table.head, *table.rows))
+    return "\n".join([*([PAIRED] if table.paired else []), head, rule, *rows])
+
+
+def _words(words: Cell) -> str:
+    return "".join(plain(piece) if isinstance(piece, str) else _span(piece) for piece in spans(words))
+
+
+def _span(span: Span) -> str:
     # a code span shows everything as it is but its own mark, and a cell's end
-    return "".join(
-        plain(piece)
-        if isinstance(piece, str)
-        else f"<sup>{plain(piece.text)}</sup>"
-        if piece.style == "raised"
-        else f"{MARKS[piece.style]}{_bare(piece.text) if piece.style == 'code' else plain(piece.text)}"
-        f"{MARKS[piece.style]}"
-        for piece in spans(words)
-    )
+    return STYLES[span.style].format(_bare(span.text) if span.style == "code" else plain(span.text))
 
 
 # what GitHub's Markdown would take for an entity, emphasis, mathematics, code, a link, an address or a mention
@@ -93,7 +81,7 @@ def plain(text: str) -> str:
     return before + inner + after if inner else before
 
 
-def _line(words: Words) -> str:
+def _line(words: Cell) -> str:
     """Words that begin a line of their own."""
     text = _words(words)
     first = re.match(r"\s*(?:[#>+=\[-]|\d+[.)])", text)

@@ -4,6 +4,7 @@ error against run time, what was painted, intervals and paired tests."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from ihbench.document.document import (
@@ -63,26 +64,28 @@ def general_report(
     return blocks
 
 
-def score_tables(results: Sequence[RunResult], presets: Sequence[str] = ()) -> list[tuple[str, Table]]:
+def score_tables(results: Sequence[RunResult], presets: Sequence[str] = ()) -> list[Table]:
     """What a paper takes from a report: for each protocol, profile and kind of data one table of all metrics and
-    regions, and one for each further preset, with a title. Raises `BadInput` where no run is done."""
+    regions, and one for each further preset, titled. Raises `BadInput` where no run is done."""
     groups: dict[tuple[str, str, str, str], list[RunResult]] = {}
     for result in results:
         if result.status == "done":
             groups.setdefault(result.group, []).append(result)
-    found: list[tuple[str, Table]] = []
+    found: list[Table] = []
     for (protocol, digest, profile, data), runs in groups.items():
         headline = runs[0].record["about"]["headline"]
         title = f"{protocol} ({digest}), {profile} profile, {data.replace('*', '')}"
         columns = [i for i in dict.fromkeys(i for r in runs for i in r.rows[r.method]) if _has_a_number(runs, i)]
         if columns:
-            found.append((title, _table(runs, [run.rows for run in runs], columns, headline, with_metric=True)))
+            table = _table(runs, [run.rows for run in runs], columns, headline, with_metric=True)
+            found.append(replace(table, title=title))
         for preset in presets:
             having = [run for run in runs if preset in run.presets]
             rows = [run.presets[preset] for run in having]
             columns = _preset_columns(rows)
             if columns:
-                found.append((f"{title}, {preset}", _table(having, rows, columns, headline, with_metric=True)))
+                table = _table(having, rows, columns, headline, with_metric=True)
+                found.append(replace(table, title=f"{title}, {preset}"))
     if not found:
         raise BadInput("--fragment: no run that is done has a number here; there is no table to write")
     return found

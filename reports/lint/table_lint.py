@@ -15,9 +15,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
 
+from ihbench.document.marks import ranks
 from ihbench.reports.lint.metric_names import BOUNDED, HeadMetric
 from ihbench.reports.lint.table_reading import Head, Number, ReadCell, ReadTable
-from ihbench.reports.paper.marks import ranks
 
 MARKED = {"best": "best", "second": "second-best"}
 FACTORS = (1000.0, 100.0)  # between units of one metric

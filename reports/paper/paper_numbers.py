@@ -13,9 +13,9 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from ihbench.document import document
 from ihbench.errors import BadInput
 from ihbench.files.regular import read_toml
-from ihbench.metrics.identity import Metric, metric_of
 
 ABSENT = "--"  # as the paper prints it
 STATUSES = ("reported", "quoted", "unreliable", "absent")
@@ -39,22 +39,14 @@ class Digits:
 
 
 @dataclass(frozen=True)
-class Column:
-    """One metric on one data set."""
+class Column(document.Column):
+    """One metric on one data set, as the paper heads it."""
 
-    group: str  # the data set, as the paper heads it
-    key: str  # "psnr"
     digits: Digits
 
-    @property
-    def metric(self) -> Metric:
-        return metric_of(self.key)
-
-    @property
-    def title(self) -> str:
-        """Such as "PSNR ↑ (dB)"."""
-        unit = f" ({self.metric.unit})" if self.metric.unit else ""
-        return f"{self.metric.title} {self.metric.arrow}{unit}"
+    def rounded(self, value: float) -> float:
+        """As it is shown: what is shown alike ranks alike."""
+        return round(value, self.digits.decimals_of(value)) if math.isfinite(value) else math.nan
 
     def text(self, value: float, like: float | None = None) -> str:
         """A value in the column's unit, with the decimals of `like` if given; "—" when absent, "∞" when infinite."""

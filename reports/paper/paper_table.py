@@ -12,14 +12,25 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+from ihbench.document.document import (
+    Block,
+    Heading,
+    Number,
+    Paragraph,
+    RowLabel,
+    Span,
+    Table,
+    bullets,
+    emphasis,
+)
+from ihbench.document.marks import marks_by_interval, marks_by_value
+from ihbench.document.short_names import Footnotes, split_label
 from ihbench.metrics import Identity, Mean, macro_mean
 from ihbench.metrics.statistics import Interval, mean_interval
 from ihbench.record.results import RunResult, group_row
 from ihbench.record.row_choice import EVERYTHING, Choice
 from ihbench.record.row_labels import by_label
-from ihbench.reports.general.short_names import Footnotes, split_label
 from ihbench.reports.general.significance import LEVEL, scene_means
-from ihbench.reports.paper.marks import marks_by_interval, marks_by_value
 from ihbench.reports.paper.paper_numbers import Column, Component, Group, PaperTable
 from ihbench.scene.protocol import REGIONS
 from ihbench.scoring.calibration import DESCRIPTIONS, ROWS
@@ -30,69 +41,24 @@ YES, NO, UNKNOWN = "✓", "", "?"
 
 
 @dataclass(frozen=True)
-class Cell:
-    """One number, what it is worth, and what must be said of it."""
-
-    text: str  # as shown, without marks: "24.65", "24.65 [23.90, 25.40]", "—"
-    value: float  # in the column's unit; NaN when absent
-    status: str  # reported, quoted, unreliable, measured, stand-in, absent
-    low: float = math.nan  # of the interval over scenes
-    high: float = math.nan
-    scenes: int = 0  # that the mean runs over; 0 for quoted numbers
-    mark: str = ""  # best, second
-    reason: str = ""  # of an absent number
-    identity: str = ""  # of a measured number
-    footnotes: tuple[str, ...] = ()  # letters
-
-    @property
-    def number(self) -> str:
-        """The text without the interval."""
-        return self.text.partition(" ")[0]
-
-    @property
-    def interval(self) -> str:
-        return self.text.partition(" ")[2]
-
-
-@dataclass(frozen=True)
-class Row:
-    label: str
-    status: str
-    cells: tuple[Cell, ...]
-    section: str = ""
-    components: tuple[str, ...] = ()  # YES, NO or UNKNOWN
-    calibration: bool = False  # bounds the methods, is not ranked
-    footnotes: tuple[str, ...] = ()  # letters: the switches that set it apart
-
-    @property
-    def name(self) -> str:
-        """The label without what stands in its footnotes."""
-        return split_label(self.label)[0] if self.footnotes else self.label
-
-
-@dataclass(frozen=True)
-class Block:
-    title: str
-    kind: Kind
-    groups: tuple[Group, ...]
-    rows: tuple[Row, ...]
-    components: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
-
-    @property
-    def columns(self) -> tuple[Column, ...]:
-        return tuple(column for group in self.groups for column in group.columns)
-
-
-@dataclass(frozen=True)
 class Frame:
     name: str  # "table1"
     title: str
     source: str
-    head: str  # of the column of row labels
-    blocks: tuple[Block, ...]
+    tables: tuple[Table, ...]
     footnotes: Mapping[str, str]  # letter -> text
     notes: tuple[str, ...] = ()
+
+    @property
+    def below(self) -> list[Block]:
+        """What the letters in the tables mean."""
+        return [Paragraph((Span(letter, "raised"), f" {text}")) for letter, text in self.footnotes.items()]
+
+    @property
+    def blocks(self) -> list[Block]:
+        """The whole document."""
+        source = Paragraph(f"Source of quoted numbers: {self.source}.")
+        return [Heading(1, self.title), source, *self.tables, *self.below, *bullets(self.notes)]
 
 
 def build_frame(
@@ -119,20 +85,15 @@ def build_frame(
         for shown in dict.fromkeys(choice.regions or (region,))
         for block in _measured(table, results, shown, bool(choice.regions), footnotes, choice)
     ]
-    blocks = [quoted, *measured]
-    blocks = [
-        replace(block, rows=tuple(replace(r, label=names.get(r.label, r.label), footnotes=_apart(r, names, footnotes))
-                                  for r in block.rows))
-        for block in blocks
-        if block.rows or not choice.rows
-    ]  # fmt: skip
+    tables = [_named(t, names, footnotes) for t in (quoted, *measured) if t.rows or not choice.rows]
+    tables = [replace(t, name=f"{table.name}-{k + 1}") for k, t in enumerate(tables)]
     notes = [*table.notes]
     if not measured:
         protocols = dict.fromkeys(p for group in table.groups for p in group.protocols)
         notes.append(f"No measured rows: no finished run under {', '.join(protocols)} was found.")
     notes += [f"Left out: {line}." for line in left_out]
     letters = {letter: text for text, letter in footnotes.letters.items()}
-    return Frame(table.name, table.title, table.source, table.head, tuple(blocks), letters, tuple(notes))
+    return Frame(table.name, table.title, table.source, tuple(tables), letters, tuple(notes))
 
 
 # ---------------------------------------------------------------------------------------------------- quoted rows
@@ -164,13 +125,20 @@ def _columns_of(table: PaperTable, choice: Choice) -> PaperTable:
     return replace(table, groups=tuple(group for group in groups if group.columns), rows=tuple(rows))
 
 
-def _apart(row: Row, names: Mapping[str, str], footnotes: Footnotes) -> tuple[str, ...]:
-    """The letter of the switches that set a row apart, where somebody has not named it."""
-    switches = "" if row.label in names or row.calibration else split_label(row.label)[1]
-    return (footnotes.letter(switches),) if switches else ()
+def _named(table: Table, names: Mapping[str, str], footnotes: Footnotes) -> Table:
+    """The table with the rows' chosen names; the switches that set another row apart go into a footnote."""
+    labels, rows = [], []
+    for label, row in zip(table.labels, table.rows, strict=True):
+        name, switches = split_label(label.name)
+        if label.name in names or label.bound or not switches:
+            name, switches = names.get(label.name, label.name), ""
+        shown: str | Span = emphasis(name) if label.bound else name
+        rows.append(((shown, Span(footnotes.letter(switches), "raised")) if switches else shown, *row[1:]))
+        labels.append(replace(label, name=names.get(label.name, label.name)))
+    return replace(table, labels=tuple(labels), rows=tuple(rows))
 
 
-def _quoted(table: PaperTable, footnotes: Footnotes, as_printed: bool, choice: Choice) -> Block:
+def _quoted(table: PaperTable, footnotes: Footnotes, as_printed: bool, choice: Choice) -> Table:
     wanted = choice.ordered({row.name: row.name for row in table.rows})
     table = replace(table, rows=tuple(next(row for row in table.rows if row.name == name) for name in wanted))
     marks: list[list[str]]
@@ -190,27 +158,30 @@ def _quoted(table: PaperTable, footnotes: Footnotes, as_printed: bool, choice: C
             reason = "not available in the paper" if absent else ""
             letters = footnotes.of(table.footnotes[key] for key in cell.footnotes)
             text = "—" if absent else cell.text
-            cells.append(Cell(text, cell.value, cell.status, mark=mark, reason=reason, footnotes=letters))
+            cells.append(Number(text, cell.value, cell.status, mark=mark, reason=reason, footnotes=letters))
         status = next((c.status for c in row.cells if c.status in ("reported", "quoted")), row.cells[0].status)
-        parts = tuple(YES if has else NO for has in row.components)
-        rows.append(Row(row.name, status, tuple(cells), row.section, parts))
-    own, others = (any(row.status == status for row in rows) for status in ("reported", "quoted"))
+        rows.append((row.name, status, *(YES if has else NO for has in row.components), *cells))
+    own, others = (any(row[1] == status for row in rows) for status in ("reported", "quoted"))
+    absent = any(cell.status == "absent" for row in table.rows for cell in row.cells)
     notes = [
         *(["reported: the paper about its own method."] if own else []),
         *(["quoted: the paper about somebody else's method."] if others else []),
-        *(["—: not available in the paper."] if any(c.status == "absent" for r in rows for c in r.cells) else []),
+        *(["—: not available in the paper."] if absent else []),
         "Marks are the paper's own." if as_printed else
         "Marks are computed from the printed values alone: the paper gives no intervals, so none of them is known to "
         "be beyond chance.",
         *(group.note for group in table.groups if group.note and not group.measured_only),
     ]  # fmt: skip
-    return Block(
-        "Quoted from the paper, not measured here",
-        "quoted",
-        tuple(group for group in table.groups if not group.measured_only),
+    parts = [part.name for part in table.components if not part.measured_only]
+    return Table(
+        (table.head, "status", *parts, *table.columns),
         tuple(rows),
-        tuple(part.name for part in table.components if not part.measured_only),
-        tuple(notes),
+        left=2,
+        ticks=len(parts),
+        labels=tuple(RowLabel(row.name, row.section) for row in table.rows),
+        title="Quoted from the paper, not measured here",
+        kind="quoted",
+        notes=tuple(notes),
     )
 
 
@@ -239,7 +210,7 @@ def _measured(
     named: bool,  # whether the title names the region
     footnotes: Footnotes,
     choice: Choice,
-) -> Iterator[Block]:
+) -> Iterator[Table]:
     """One block for each combination of data, profile and protocol; real data first."""
     by_kind = _by_kind(table, results)
     for standin, profile in sorted(by_kind, key=lambda key: (bool(key[0]), *key)):
@@ -274,7 +245,7 @@ def _measured_block(
     region: str,
     footnotes: Footnotes,
     choice: Choice,
-) -> Block:
+) -> Table:
     everything = list({id(run): run for _, runs in filled for run in runs}.values())
     labelled = by_label(_configured(everything))
     wanted = choice.ordered({label: having[0].method for label, having in labelled.items()})
@@ -288,7 +259,7 @@ def _measured_block(
         )
     unlabelled = [run for run in everything if "changed" not in run.record["about"]]
     notes += [f"Not done: {run.method} on {_outcome(run)}." for run in unlabelled]
-    columns: list[list[Cell]] = []  # by column, then by row
+    columns: list[list[Number]] = []  # by column, then by row
     calibrations = choice.bounds([name for name in ROWS if any(name in run.rows for run in everything)])
     for group, runs in filled:
         done = [run for run in runs if run.status == "done"]
@@ -303,7 +274,7 @@ def _measured_block(
             ]
             marks = marks_by_interval(
                 list(labelled),
-                [float(cell.number) if math.isfinite(cell.value) else math.nan for cell, _ in ranked],
+                [column.rounded(cell.value) for cell, _ in ranked],
                 [scenes for _, scenes in ranked],
                 column.metric.higher_is_better,
                 LEVEL,
@@ -316,23 +287,29 @@ def _measured_block(
                 cells.append(_bound(column, done, row, identity, kind, footnotes))
             columns.append(cells)
     parts = [_components(table.components, having) for having in labelled.values()]
+    parts += [(NO,) * len(table.components)] * len(calibrations)
+    labels = [*map(RowLabel, labelled), *(RowLabel(name, bound=True) for name in calibrations)]
     rows = [
-        Row(label, MEASURED[kind], tuple(cells[j] for cells in columns), components=parts[j])
-        for j, label in enumerate(labelled)
+        (label.name, MEASURED[kind], *parts[k], *(cells[k] for cells in columns)) for k, label in enumerate(labels)
     ]
-    rows += [
-        Row(name, MEASURED[kind], tuple(cells[len(rows) + k] for cells in columns),
-            components=(NO,) * len(table.components), calibration=True)
-        for k, name in enumerate(calibrations)
-    ]  # fmt: skip
     notes.append(
         f"Mean over seeds within a scene, then over scenes, with the {LEVEL:.0%} interval over scenes. A mark says "
         "that the row differs from every other one over common scenes (interval of the paired difference)."
     )
     notes += [f"{name}: {DESCRIPTIONS[name]}; a bound, not ranked." for name in calibrations]
     title = f"Measured here on {'STAND-INS, not on real data' if standin else 'real data'}, {profile} profile"
-    used = tuple(group for group, _ in filled)
-    return Block(title, kind, used, tuple(rows), tuple(part.name for part in table.components), tuple(notes))
+    shown = [column for group, _ in filled for column in group.columns]
+    return Table(
+        (table.head, "status", *(part.name for part in table.components), *shown),
+        tuple(rows),
+        left=2,
+        ticks=len(table.components),
+        labels=tuple(labels),
+        title=title,
+        kind=kind,
+        paired=True,
+        notes=tuple(notes),
+    )
 
 
 def _identity(done: Sequence[RunResult], group: Group, metric: str, region: str) -> str:
@@ -354,7 +331,7 @@ def _means(runs: Sequence[RunResult], identity: str, views: str) -> list[Mean]:
 
 def _cell(
     column: Column, runs: Sequence[RunResult], views: str, identity: str, kind: Kind, footnotes: Footnotes
-) -> tuple[Cell, dict[str, float]]:
+) -> tuple[Number, dict[str, float]]:
     """A method's cell, and its finite means by scene."""
     done = [run for run in runs if run.status == "done"]
     if not done:
@@ -375,32 +352,34 @@ def _cell(
 
 def _bound(
     column: Column, done: Sequence[RunResult], row: str, identity: str, kind: Kind, footnotes: Footnotes
-) -> Cell:
+) -> Number:
     """A calibration row's cell: the same for every run on a scene."""
     means = scene_means(done, identity, row)
     if not means:
         return _absent(f"not scored on {column.group}", footnotes)
     cell = _filled(column, means, identity, kind, footnotes)
-    return replace(cell, text=cell.number, low=math.nan, high=math.nan)
+    return replace(cell, interval="", low=math.nan, high=math.nan)
 
 
-def _filled(column: Column, means: Mapping[str, Mean], identity: str, kind: Kind, footnotes: Footnotes) -> Cell:
+def _filled(column: Column, means: Mapping[str, Mean], identity: str, kind: Kind, footnotes: Footnotes) -> Number:
     total, scale = macro_mean(means), column.metric.scale
     if total.absent:
         return _absent(total.reason, footnotes)
     finite = {scene: mean.value for scene, mean in means.items() if math.isfinite(mean.value)}
-    value, low, high = total.value * scale, math.nan, math.nan
-    text = column.text(value)
+    value, low, high, shown = total.value * scale, math.nan, math.nan, ""
     if len(finite) > 1:
         interval: Interval = mean_interval(finite, LEVEL)
         low, high = interval.low * scale, interval.high * scale
-        text += f" [{column.text(low, value)}, {column.text(high, value)}]"
+        shown = f"[{column.text(low, value)}, {column.text(high, value)}]"
     letters = footnotes.of([f"over scenes: {total.note}"] if total.note else [])
-    return Cell(text, value, MEASURED[kind], low, high, max(len(finite), 1), identity=identity, footnotes=letters)
+    return Number(
+        column.text(value), value, MEASURED[kind], shown, low, high, max(len(finite), 1), identity=identity,
+        footnotes=letters,
+    )  # fmt: skip
 
 
-def _absent(reason: str, footnotes: Footnotes) -> Cell:
-    return Cell("—", math.nan, "absent", reason=reason, footnotes=footnotes.of([reason]))
+def _absent(reason: str, footnotes: Footnotes) -> Number:
+    return Number("—", math.nan, "absent", reason=reason, footnotes=footnotes.of([reason]))
 
 
 def _outcome(run: RunResult) -> str:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -15,8 +14,7 @@ from ihbench.record import outputs
 
 if TYPE_CHECKING:
     from ihbench.record.results import RunResult
-
-FORMATS = {"md": "markdown", "tex": "latex", "html": "html"}  # -> module of the writer
+    from ihbench.reports.paper.paper_table import Frame
 
 
 @dataclass(frozen=True)
@@ -29,7 +27,7 @@ class TableOptions:
     """Only runs under this profile."""
     region: str = ""
     """Region of measured numbers, such as full; by default every protocol's headline region."""
-    format: Literal["md", "tex", "html", "csv", "json"] = "md"
+    format: Literal["terminal", "md", "tex", "html", "csv", "json"] = "md"
     """How it is written."""
     regions: tuple[str, ...] = ()
     """Several regions of measured numbers, a block for each."""
@@ -68,7 +66,7 @@ class TableCommand:
         results, left_out = _results(chosen, [p for group in table.groups for p in group.protocols])
         choice = Choice(chosen.rows, chosen.metrics, chosen.regions, chosen.names)
         frame = build_frame(table, results, chosen.region, chosen.as_printed, choice, left_out)
-        text = _writer(chosen.format, chosen.fragment)(frame)
+        text = written(frame, chosen.format, chosen.fragment)
         if chosen.out is None:
             print(text, end="")
         else:
@@ -76,16 +74,29 @@ class TableCommand:
         return 0
 
 
-def _writer(name: str, fragment: bool) -> Callable[..., str]:
-    """Imported when asked for: a page or a document brings more than a CSV file needs."""
-    if name in ("csv", "json"):
-        from ihbench.reports.paper.table_data import write_csv, write_json
+def written(frame: Frame, form: str, fragment: bool = False) -> str:
+    """The table in a format. Raises `BadInput` for a fragment of what is none."""
+    from ihbench.document import csv, document
 
-        if fragment:
-            raise BadInput(f"--fragment: {name} has no document around it; leave it out, or take tex, md or html")
-        return write_csv if name == "csv" else write_json
-    module = import_module(f"ihbench.reports.paper.table_{FORMATS[name]}")
-    return module.fragment if fragment else module.write
+    if form not in ("csv", "json"):
+        return (
+            document.write_fragment([*frame.tables, *frame.below], form)
+            if fragment
+            else document.write(frame.blocks, form)
+        )
+    if fragment:
+        raise BadInput(f"--fragment: {form} has no document around it; leave it out, or take tex, md or html")
+    if form == "csv":
+        return csv.write_cells({"table": frame.name}, frame.tables, frame.footnotes)
+    content = {
+        "table": frame.name,
+        "title": frame.title,
+        "source": frame.source,
+        "blocks": [csv.table_data(table, frame.footnotes) for table in frame.tables],
+        "footnotes": dict(frame.footnotes),
+        "notes": list(frame.notes),
+    }
+    return json.dumps(atomic.encode(content), indent=1) + "\n"
 
 
 def _results(chosen: TableOptions, protocols: list[str]) -> tuple[list[RunResult], list[str]]:

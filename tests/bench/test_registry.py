@@ -65,7 +65,7 @@ def test_two_packages_of_others_clash_as_well(install):
 def test_one_distribution_in_two_places_and_one_object_under_two_are_no_clash(install):
     install("one", "method", "same = one:Method")
     install("one", "method", "same = older:Method", place="another")
-    install("fork", "report", "md = ihbench.reports.general.markdown:write")
+    install("fork", "report", "md = ihbench.reports.general.report:MARKDOWN")
     assert registry.clashes("method") == registry.clashes("report") == {}
     assert registry.load("report", "md") is not None
 

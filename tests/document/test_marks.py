@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ihbench.reports.paper.marks import marks_by_interval, marks_by_value, ranks
+from ihbench.document.marks import marks_by_interval, marks_by_value, ranks
 
 # few different values make ties common
 quickly = settings(max_examples=50, deadline=None)

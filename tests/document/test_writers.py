@@ -14,12 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from ihbench.document import diagram
+from ihbench.document import csv, diagram, html, latex, markdown
 from ihbench.document.document import Bullets, Heading, Paragraph, Table, code, strong
 from ihbench.errors import BadInput, Diverged
-from ihbench.reports.general import html, latex, markdown
+from ihbench.reports.general import report
 from ihbench.reports.general.content import general_report
-from ihbench.reports.paper import table_html
 from tests.reports.made_up_runs import made_up
 
 NASTY = r"""<script>alert(1)</script> & "x" 'y' \write18{rm} $a_b^c$ 100% #1 {~} | `q` ]( ↑ 文"""
@@ -61,14 +60,14 @@ def parsed(text):
 
 
 def test_html_shows_every_word_as_it_is_and_runs_none():
-    found = parsed(html.page(BLOCKS))
+    found = parsed(html.write(BLOCKS))
     assert "script" not in found.tags
     assert "".join(found.text).count(NASTY) == 7
     assert not [name for name, _ in found.attributes if name.startswith("on")]
 
 
 def test_html_is_one_file_that_fetches_nothing(tmp_path):
-    text = html.write([made_up(tmp_path, scene=NASTY.replace("/", " "))])
+    text = report.HTML([made_up(tmp_path, scene=NASTY.replace("/", " "))])
     found = parsed(text)
     links = [value for name, value in found.attributes if name in ("src", "href", "srcset", "action")]
     assert len(links) >= 2
@@ -78,7 +77,7 @@ def test_html_is_one_file_that_fetches_nothing(tmp_path):
 
 
 def test_latex_has_no_active_character_of_anybodys():
-    text = latex.latex(BLOCKS)
+    text = latex.write(BLOCKS)
     body = text.split(r"\begin{document}")[1]
     assert r"\write18" not in body
     assert r"\textbackslash{}write18\{rm\}" in body
@@ -112,13 +111,13 @@ def test_whatever_text_it_is_latex_stays_balanced_and_on_its_line(text):
 @given(st.text(max_size=30))
 @settings(deadline=None, derandomize=True, max_examples=200)
 def test_whatever_text_it_is_a_markdown_row_keeps_its_cells(text):
-    row = markdown.markdown([Table(("a", "b"), ((text, "1"),))]).splitlines()[2]
+    row = markdown.write([Table(("a", "b"), ((text, "1"),))]).splitlines()[2]
     assert len(re.split(r"(?<!\\)\|", row)) == 4
     assert "<" not in row
 
 
 def test_latex_tables_are_booktabs_with_as_many_cells_as_columns(tmp_path):
-    text = latex.write([made_up(tmp_path), made_up(tmp_path, "b", seed=1)])
+    text = report.LATEX([made_up(tmp_path), made_up(tmp_path, "b", seed=1)])
     assert balanced(text)
     tables = re.findall(r"\\begin\{tabular\}\{([lr]+)\}\n(.*?)\\end\{tabular\}", text, re.S)
     assert len(tables) >= 5
@@ -133,7 +132,7 @@ def test_the_three_say_the_same_numbers(tmp_path):
     runs = [made_up(tmp_path, s, psnr=p) for s, p in (("a", 23.456), ("b", 27.891))]
     found = [
         sorted(re.findall(r"\d+\.\d{2,4}(?!\d)", re.sub(r"<style>.*?</style>|src=\"[^\"]*\"", "", text, flags=re.S)))
-        for text in (markdown.write(runs), latex.write(runs), html.page(general_report(runs)))
+        for text in (report.MARKDOWN(runs), report.LATEX(runs), html.write(general_report(runs)))
     ]
     assert found[0] == found[1] == found[2]
     assert "25.67" in found[0]
@@ -144,9 +143,9 @@ def test_pictures_are_named_relative_to_where_the_text_lies(tmp_path):
     picture.parent.mkdir(parents=True)
     picture.write_bytes(b"\x89PNG")
     shown = {"pictures": [(picture, "What | it <shows>")], "folder": tmp_path / "out"}
-    assert "(<figures/a%20b.png>)" in markdown.write([], **shown)
-    assert r"\detokenize{figures/a b.png}" in latex.write([], **shown)
-    assert "data:image/png;base64,iVBORw==" in html.write([], **shown)
+    assert "(<figures/a%20b.png>)" in report.MARKDOWN([], **shown)
+    assert r"\detokenize{figures/a b.png}" in report.LATEX([], **shown)
+    assert "data:image/png;base64,iVBORw==" in report.HTML([], **shown)
 
 
 LIVELY = [
@@ -160,7 +159,7 @@ UNSEEN = "a\x1b[31mb\x07\u202ec\u2066d\u200be\u2028f\x9bg\U000e0041h\ud800"
 
 @pytest.mark.parametrize("text", LIVELY)
 def test_markdown_of_any_name_shows_it_and_links_nothing(text):
-    source = markdown.markdown([Paragraph(text), Bullets((text,)), Table(("h",), ((text,),)), Heading(2, text)])
+    source = markdown.write([Paragraph(text), Bullets((text,)), Table(("h",), ((text,),)), Heading(2, text)])
     page = cmarkgfm.github_flavored_markdown_to_html(source, options=Options.CMARK_OPT_UNSAFE)
     allowed = {"p", "ul", "li", "table", "thead", "tbody", "tr", "th", "td", "h2"}
     assert set(parsed(page).tags) == allowed
@@ -169,10 +168,10 @@ def test_markdown_of_any_name_shows_it_and_links_nothing(text):
 
 
 def csv_cell(_):
-    return diagram.harmless(UNSEEN)
+    return csv.harmless(UNSEEN)
 
 
-@pytest.mark.parametrize("write", [markdown.markdown, latex.latex, html.page, csv_cell])
+@pytest.mark.parametrize("write", [markdown.write, latex.write, html.write, csv_cell])
 def test_unseen_characters_reach_no_report(write):
     text = write(
         [Heading(2, UNSEEN), Paragraph((UNSEEN, strong(UNSEEN), code(UNSEEN))), Table((UNSEEN,), ((UNSEEN,),))]
@@ -196,8 +195,8 @@ def test_diagrams_take_any_name(text, tmp_path):
     assert text.replace("\x1b", "\\x1b") in svg
 
 
-@pytest.mark.parametrize("page", [html.page([]), table_html.POLICY])
-def test_the_pages_policy_forbids_forms_and_another_base(page):
+def test_the_pages_policy_forbids_forms_and_another_base():
+    page = html.write([])
     assert "form-action 'none'" in unescape(page)
     assert "base-uri 'none'" in unescape(page)
 
@@ -208,7 +207,7 @@ def test_the_page_has_the_runs_own_pictures_and_survives_spoiled_ones(tmp_path):
     (linked.folder / "contact_sheet.png").symlink_to(good.folder / "contact_sheet.png")
     (text.folder / "contact_sheet.png").write_text("no picture")
     os.mkfifo(text.folder / "inpainting.png")
-    page = html.write([good, linked, text])
+    page = report.HTML([good, linked, text])
     assert page.count(": test views (p@1, quick)</figcaption>") == 1
     assert "ours on a, seed 0: test views" in page
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from rich.cells import cell_len
 
-from ihbench.reports.general.terminal import write
+from ihbench.reports.general.headline import write
 from tests.reports.fake_runs import fake_run, write_run
 from tests.reports.test_report_verbs import ihbench  # noqa: F401 (a fixture)
 

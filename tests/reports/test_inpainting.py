@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ihbench.document.markdown import write as markdown
 from ihbench.record.results import RunResult
 from ihbench.reports.general.inpainting import inpainting_section
-from ihbench.reports.general.markdown import markdown
 
 
 def event(delta_e, views=3):

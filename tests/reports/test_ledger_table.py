@@ -7,10 +7,10 @@ import math
 import pytest
 
 from ihbench.clock.ledger import Ledger
+from ihbench.document.markdown import write as markdown
 from ihbench.files.atomic import read_json
 from ihbench.record.results import RunResult, read_result
 from ihbench.reports.general.ledger_table import TOLERANCE, account, ledger_section
-from ihbench.reports.general.markdown import markdown
 from tests.reports.made_up_runs import made_up
 
 

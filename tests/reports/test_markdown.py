@@ -8,7 +8,7 @@ import pytest
 
 from ihbench.metrics import Mean
 from ihbench.record.results import RunResult
-from ihbench.reports.general.markdown import write
+from ihbench.reports.general.report import MARKDOWN as write
 
 PSNR, SSIM = "psnr/pooled/range1/{}/v1", "ssim/gauss11-1.5/range1/{}/v1"
 REGIONS = ("full", "body", "hidden")

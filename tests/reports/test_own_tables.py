@@ -8,14 +8,14 @@ from dataclasses import replace
 
 import pytest
 
+from ihbench.document.document import write, write_fragment
+from ihbench.document.short_names import split_label, with_short_names
 from ihbench.errors import BadInput
 from ihbench.record.row_choice import Choice
-from ihbench.reports.general import html, latex, markdown
-from ihbench.reports.general.short_names import split_label, with_short_names
+from ihbench.reports.general.report import HTML, LATEX, MARKDOWN
 from ihbench.reports.lint.metric_names import head_metric
 from ihbench.reports.lint.table_files import read_tables
 from ihbench.reports.lint.table_lint import lint
-from ihbench.reports.paper import table_html, table_latex, table_markdown
 from ihbench.reports.paper.paper_numbers import paper_table
 from ihbench.reports.paper.paper_table import build_frame
 from tests.reports.fake_runs import SUBJECTS, fake_run
@@ -33,6 +33,10 @@ def linted(text, kind, tmp_path):
     assert reading.tables
     assert not reading.notes
     return lint(reading.tables)
+
+
+def fragment(frame, kind):
+    return write_fragment([*frame.tables, *frame.below], kind)
 
 
 def random_runs(seed):
@@ -60,10 +64,10 @@ def test_the_general_report_passes(tmp_path, scenes, psnr):
     runs = sweep(tmp_path / "runs", scenes, (0, 1))
     runs += [made_up(tmp_path / "more", s, "third", psnr=psnr, of=55, views=6) for s in scenes]
     many = [made_up(tmp_path / "more", s, "long", changed=[f"a.b{k}={k}" for k in range(12)]) for s in scenes]
-    for write in (latex.write, markdown.write):
+    for report in (LATEX, MARKDOWN):
         for fragment in (False, True):
-            text = write([*runs, *many], fragment=fragment)
-            assert linted(text, "tex" if write is latex.write else "md", tmp_path) == []
+            text = report([*runs, *many], fragment=fragment)
+            assert linted(text, "tex" if report is LATEX else "md", tmp_path) == []
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -78,8 +82,8 @@ def test_the_papers_tables_pass_with_measured_rows(tmp_path, table, seed):
         else Choice(tuple(rng.sample(names, 3)) + ("ours",) * bool(runs), rng.choice(((), ("psnr",))))
     )
     frame = build_frame(table, runs, choice=choice)
-    for writer, kind in ((table_latex, "tex"), (table_markdown, "md")):
-        for text in (writer.write(frame), writer.fragment(frame)):
+    for kind in ("tex", "md"):
+        for text in (write(frame.blocks, kind), fragment(frame, kind)):
             assert linted(text, kind, tmp_path) == []
 
 
@@ -113,9 +117,9 @@ def test_fragments_and_documents_are_well_formed(tmp_path, seed):
     frame = build_frame(TABLE1, runs, choice=Choice(regions=("body", "hidden")))
     own = [*sweep(tmp_path), made_up(tmp_path, "a", "x_y & z", changed=("p%=1", "q=$2"))]
     begin, end = "\\begin{document}\n", "\n\\end{document}\n"
-    for text in (latex.write(own), table_latex.write(frame)):
+    for text in (LATEX(own), write(frame.blocks, "tex")):
         assert structure(text) == []
-    for text in (latex.write(own, fragment=True), table_latex.fragment(frame)):
+    for text in (LATEX(own, fragment=True), fragment(frame, "tex")):
         assert not re.search(r"\\(documentclass|fitted|begin\{(table|document)\})", text)
         assert structure(begin + text + end) == []
         columns_are_as_declared(text)
@@ -153,22 +157,22 @@ def test_switches_leave_the_name_and_nothing_else_does(label, name, switches):
 
 def test_a_fragment_says_what_its_letters_mean():
     frame = build_frame(TABLE1, random_runs(1), choice=Choice(("ours", "ours (levels=(64, 128), inpaint.on=False)")))
-    for writer in (table_latex, table_markdown, table_html):
-        text = writer.fragment(frame)
+    for kind in ("tex", "md", "html"):
+        text = fragment(frame, kind)
         for letter, words in frame.footnotes.items():
             assert re.search(rf"(<sup>|superscript{{){letter}(</sup>|}}) {words.split()[0][:6]}", text)
 
 
 def test_rows_are_short_in_latex_and_the_switches_stand_below(tmp_path):
-    text = latex.write(sweep(tmp_path))
+    text = LATEX(sweep(tmp_path))
     rows = [line for line in text.splitlines() if line.endswith(r"\\") and line.startswith("ours")]
     assert rows
     assert not any("=" in line.partition("&")[0] for line in rows)
     assert r"ours\textsuperscript{a} &" in text
     assert r"\textsuperscript{a} steps=50; \textsuperscript{b} steps=200" in text
     frame = build_frame(TABLE1, random_runs(1))
-    for write in (table_latex.write, table_markdown.write, table_html.write):
-        text = write(frame)
+    for kind in ("tex", "md", "html"):
+        text = write(frame.blocks, kind).replace("<tr>", "\n<tr>")
         assert "levels=(64, 128), inpaint.on=False" in text  # in a footnote
         rows = [line for line in text.splitlines() if re.match(r"\|? ?(<tr><td class=.left.>)?ours", line)]
         assert len(rows) == 2
@@ -178,8 +182,8 @@ def test_rows_are_short_in_latex_and_the_switches_stand_below(tmp_path):
 
 def test_in_markdown_and_on_pages_only_long_names_are_cut(tmp_path):
     long = made_up(tmp_path, changed=[f"switch{k}={k}" for k in range(8)])
-    for write in (markdown.write, html.write):
-        text = write([*sweep(tmp_path), long])
+    for report in (MARKDOWN, HTML):
+        text = report([*sweep(tmp_path), long])
         assert "ours (steps=50)" in text
         assert "ours<sup>a</sup>" in text
         assert "<sup>a</sup> switch0=0, switch1=1" in text
@@ -197,7 +201,7 @@ def test_one_text_has_one_letter_in_a_document():
 # ------------------------------------------------------------------------------------------------------- choices
 
 
-WRITERS = {"md": markdown.write, "tex": latex.write, "html": html.write}
+WRITERS = {"md": MARKDOWN, "tex": LATEX, "html": HTML}
 
 
 @pytest.mark.parametrize("kind", WRITERS)
@@ -246,28 +250,28 @@ def test_unknown_words_are_answered_with_the_nearest(tmp_path, choice, message):
 
 def test_marks_are_those_among_the_rows_that_are_shown():
     frame = build_frame(TABLE1, [], choice=Choice(("OccNeRF", "GauHuman", "HumanNeRF"), ("psnr",)))
-    (block,) = frame.blocks
-    assert [row.label for row in block.rows] == ["OccNeRF", "GauHuman", "HumanNeRF"]
-    assert [row.cells[0].mark for row in block.rows] == ["best", "second", ""]
-    assert {column.key for column in block.columns} == {"psnr"}
+    (table,) = frame.tables
+    assert [label.name for label in table.labels] == ["OccNeRF", "GauHuman", "HumanNeRF"]
+    assert [row[2].mark for row in table.rows] == ["best", "second", ""]
+    assert {column.key for column in table.head[2:]} == {"psnr"}
 
 
 def test_measured_blocks_are_there_for_every_region():
     runs = [fake_run(s, m, 20.0 + k) for s in SUBJECTS for k, m in enumerate(("ours", "theirs"))]
     frame = build_frame(TABLE1, runs, choice=Choice(regions=("body", "hidden"), names=("ours=We",)))
-    titles = [block.title for block in frame.blocks[1:]]
+    titles = [table.title for table in frame.tables[1:]]
     assert [title.rpartition(", ")[2] for title in titles] == ["region body", "region hidden"]
-    assert {row.label for row in frame.blocks[1].rows} >= {"We", "theirs", "truth"}
-    assert build_frame(TABLE1, runs, choice=Choice(regions=("body", "body"))).blocks[2:] == ()
+    assert {label.name for label in frame.tables[1].labels} >= {"We", "theirs", "truth"}
+    assert build_frame(TABLE1, runs, choice=Choice(regions=("body", "body"))).tables[2:] == ()
     only = build_frame(TABLE1, runs, choice=Choice(("theirs",)))
-    assert [[row.label for row in block.rows] for block in only.blocks] == [["theirs"]]
+    assert [[label.name for label in table.labels] for table in only.tables] == [["theirs"]]
 
 
 def test_a_run_with_a_name_of_its_own_keeps_the_mark_of_missing_views(tmp_path):
     run = made_up(tmp_path)
     run.record["about"]["predictions"] = {"missing": ["x"], "views": 4}
     named = Choice(names=("ours=Mine",)).applied([run])
-    text = markdown.write(named)
+    text = MARKDOWN(named)
     assert "| Mine (only 3 of 4 views) |" in text
 
 

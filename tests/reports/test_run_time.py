@@ -9,13 +9,13 @@ from dataclasses import replace
 
 import pytest
 
+from ihbench.document.markdown import write as markdown
 from ihbench.metrics.statistics import Interval
 from ihbench.record.quality_time import Target
 from ihbench.reports.general.configurations import configurations, sweeps
 from ihbench.reports.general.figures import ROOM, _shown, draw
-from ihbench.reports.general.html import write as html_write
-from ihbench.reports.general.latex import write as latex_write
-from ihbench.reports.general.markdown import markdown, write
+from ihbench.reports.general.report import HTML, LATEX
+from ihbench.reports.general.report import MARKDOWN as write
 from ihbench.reports.general.run_time import across_sizes_section, run_time_section, work_points
 from tests.reports.made_up_runs import FLIP, PSNR, made_up, sweep
 
@@ -135,7 +135,7 @@ def test_times_are_medians_over_scenes_and_never_is_an_outcome(tmp_path):
 
 def test_a_time_to_a_quality_that_the_table_lacks_says_on_which_views_it_was_reached(tmp_path):
     runs = [made_up(tmp_path, psnr=17.8), made_up(tmp_path, method="theirs", psnr=23.0)]
-    for write_in in (write, latex_write, html_write):
+    for write_in in (write, LATEX, HTML):
         text = write_in(runs, targets=[Target("psnr", 18.0), Target("psnr", 24.0), Target("psnr", 16.0)])
         assert "4 s on 3 of 4 views; the table has 17.80" in text
         assert text.count("on 3 of 4 test views") >= 3  # the titles of times and areas, and what is below

@@ -12,10 +12,9 @@ from html.parser import HTMLParser
 import pytest
 
 from ihbench.reports.lint.table_files import read_tables
-from ihbench.reports.paper import table_data, table_latex, table_markdown
 from ihbench.reports.paper.paper_numbers import paper_table
 from ihbench.reports.paper.paper_table import build_frame
-from ihbench.reports.paper.table_html import write as write_html
+from ihbench.reports.paper.table_command import written
 from tests.reports.fake_runs import SUBJECTS, fake_run
 
 NASTY = '<b>x</b> & 50% | $a_b$ #1 ~^ {c} \\d *e* `f` [g] "h" 人'
@@ -52,7 +51,7 @@ def ablation():
 
 def cells_of(frame):
     """(number, mark) of every cell, block by block and row by row."""
-    return [[[(c.number, c.mark) for c in row.cells] for row in block.rows] for block in frame.blocks]
+    return [[[(c.text, c.mark) for c in t.numbers(k)] for k in range(len(t.rows))] for t in frame.tables]
 
 
 def read_back(text, suffix, tmp_path):
@@ -101,21 +100,21 @@ class Cells(HTMLParser):
 def test_every_format_holds_the_same_numbers_and_marks(frame, ablation, tmp_path):
     for one in (frame, ablation):
         expected = cells_of(one)
-        assert read_back(table_markdown.write(one), ".md", tmp_path) == expected
-        assert read_back(table_latex.write(one), ".tex", tmp_path) == expected
+        assert read_back(written(one, "md"), ".md", tmp_path) == expected
+        assert read_back(written(one, "tex"), ".tex", tmp_path) == expected
         page = Cells()
-        page.feed(write_html(one))
+        page.feed(written(one, "html"))
         assert [[[tuple(c) for c in row] for row in table] for table in page.tables] == expected
         flat = [cell for block in expected for row in block for cell in row]
-        lines = list(csv.DictReader(io.StringIO(table_data.write_csv(one))))
+        lines = list(csv.DictReader(io.StringIO(written(one, "csv"))))
         assert [(line["text"].partition(" ")[0], line["mark"]) for line in lines] == flat
-        content = json.loads(table_data.write_json(one), parse_constant=lambda name: pytest.fail(f"no JSON: {name}"))
+        content = json.loads(written(one, "json"), parse_constant=lambda name: pytest.fail(f"no JSON: {name}"))
         found = [c for b in content["blocks"] for row in b["rows"] for c in row["cells"]]
         assert [(c["text"].partition(" ")[0], c["mark"]) for c in found] == flat
 
 
 def test_csv_and_json_have_status_interval_and_words_for_every_cell(frame):
-    lines = list(csv.DictReader(io.StringIO(table_data.write_csv(frame))))
+    lines = list(csv.DictReader(io.StringIO(written(frame, "csv"))))
     (one,) = [
         line for line in lines
         if (line["row"], line["group"], line["metric"], line["kind"]) == ("good", "ZJU-MoCap", "PSNR", "stand-in")
@@ -138,18 +137,18 @@ def test_csv_and_json_have_status_interval_and_words_for_every_cell(frame):
 
 
 def test_names_from_elsewhere_are_no_formulas_and_no_tags(frame):
-    text = table_data.write_csv(frame)
+    text = written(frame, "csv")
     labels = {line["row"] for line in csv.DictReader(io.StringIO(text))}
     assert "'=cmd()" in labels
     assert NASTY in labels
     page = Cells()
-    page.feed(write_html(frame))
+    page.feed(written(frame, "html"))
     assert {"b", "script"}.isdisjoint(page.tags)
-    assert "&lt;b&gt;x&lt;/b&gt; &amp; 50% |" in write_html(frame)
+    assert "&lt;b&gt;x&lt;/b&gt; &amp; 50% |" in written(frame, "html")
 
 
 def test_a_page_needs_nothing_beside_it_and_is_balanced(frame):
-    text = write_html(frame)
+    text = written(frame, "html")
     assert not re.search(r"(src|href)=|<script|<link|@import|url\(", text)
     page = Cells()
     page.feed(text)
@@ -158,15 +157,15 @@ def test_a_page_needs_nothing_beside_it_and_is_balanced(frame):
 
 def test_markdown_keeps_its_columns(frame, ablation):
     for one in (frame, ablation):
-        for part in table_markdown.write(one).split("### ")[1:]:
+        for part in written(one, "md").split("### ")[1:]:
             widths = {len(re.findall(r"(?<!\\)\|", line)) for line in part.splitlines() if line.startswith("|")}
             assert len(widths) == 1
 
 
 def test_stand_in_blocks_say_so_in_every_format(frame):
-    assert "### Measured here on STAND-INS, not on real data" in table_markdown.write(frame)
-    assert "STAND-INS, not on real data" in table_latex.write(frame)
-    assert '<section class="stand-in"><h2>Measured here on STAND-INS' in write_html(frame)
+    assert "### Measured here on STAND-INS, not on real data" in written(frame, "md")
+    assert "STAND-INS, not on real data" in written(frame, "tex")
+    assert '<section class="stand-in"><h2>Measured here on STAND-INS' in written(frame, "html")
 
 
 # ---------------------------------------------------------------------------------------------- LaTeX, without TeX
@@ -209,12 +208,12 @@ def structure(text):
 
 def test_latex_is_well_formed(frame, ablation):
     for one in (frame, ablation):
-        text = table_latex.write(one)
+        text = written(one, "tex")
         assert structure(text) == []
         for rule in (r"\toprule", r"\midrule", r"\bottomrule"):
-            assert text.count(rule) >= len(one.blocks)
+            assert text.count(rule) >= len(one.tables)
         assert "booktabs" in text
-        assert len(set(re.findall(r"\\label\{(.*?)\}", text))) == len(one.blocks)
+        assert len(set(re.findall(r"\\label\{(.*?)\}", text))) == len(one.tables)
 
 
 @pytest.mark.parametrize(
@@ -230,19 +229,19 @@ def test_latex_is_well_formed(frame, ablation):
     ],
 )
 def test_the_checker_sees_what_tex_would_refuse(frame, old, new):
-    text = table_latex.write(frame)
+    text = written(frame, "tex")
     assert old in text
     assert structure(text.replace(old, new, 1)) != []
 
 
 def test_a_label_is_not_taken_for_the_argument_of_a_row():
     frame = build_frame(paper_table("table1"), [fake_run("a", "[1cm]"), fake_run("a", "*")])
-    assert structure(table_latex.write(frame)) == []
+    assert structure(written(frame, "tex")) == []
 
 
 def test_infinite_and_absent_numbers_are_strings_or_nothing_for_programs(frame):
-    content = json.loads(table_data.write_json(frame))
+    content = json.loads(written(frame, "json"))
     truths = [row for block in content["blocks"] for row in block["rows"] if row["row"] == "truth"]
     assert truths[0]["cells"][0]["value"] == "inf"
-    lines = [line for line in csv.DictReader(io.StringIO(table_data.write_csv(frame))) if line["row"] == "truth"]
+    lines = [line for line in csv.DictReader(io.StringIO(written(frame, "csv"))) if line["row"] == "truth"]
     assert math.isinf(float(lines[0]["value"]))
