@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import builtins
-import codecs
 import contextlib
 import copyreg
-import functools
 import operator
 import os
 import pickle
 import struct
-import subprocess
 import sys
 import time
 import tracemalloc
@@ -78,16 +75,9 @@ def array(shape: bytes, kind: bytes, data: bytes) -> bytes:
     return EMPTY_ARRAY + b"(K\x01" + shape + kind + b"\x89" + data + b"tb"
 
 
-def nested_pairs(levels: int, pair: str = "tuple") -> bytes:
-    """Billion laughs: each level holds the one below twice; memo index `levels` is the outermost."""
-    program = b"N" + put(0)
-    for k in range(levels):
-        twice = get(k) + get(k)
-        program += {"tuple": twice + b"\x86", "list": b"](" + twice + b"e", "dict": b"}(Na" + b"I1\n" + twice[:5]}[
-            pair
-        ]
-        program += put(k + 1)
-    return program
+def nested_pairs(levels: int) -> bytes:
+    """Billion laughs: each level holds the one below twice."""
+    return b"N" + put(0) + b"".join(get(k) * 2 + b"\x86" + put(k + 1) for k in range(levels))
 
 
 class Reduced:
@@ -98,18 +88,6 @@ class Reduced:
 
     def __reduce__(self):
         return self.call
-
-
-class WithState(Reduced):
-    def __init__(self, function, arguments, state):
-        self.call = (function, arguments, state)
-
-
-def renamed(data: bytes, old: str, new: str) -> bytes:
-    """Another module name in a pickle of protocol 2 or lower."""
-    changed = data.replace(b"c" + old.encode() + b"\n", b"c" + new.encode() + b"\n")
-    assert changed != data
-    return changed
 
 
 def python(mark: Path) -> str:
@@ -125,48 +103,24 @@ def programs(mark: Path) -> dict[str, bytes]:
     run = (s(shell),)
     return {
         "os.system": call(g("os", "system"), *run) + STOP,
-        "posix.system": pickle.dumps(Reduced(os.system, shell)),
-        "subprocess.run": pickle.dumps(Reduced(subprocess.run, ["touch", str(mark)]), 0),
         "builtins.eval": pickle.dumps(Reduced(builtins.eval, code)),
-        "builtins.exec": pickle.dumps(Reduced(builtins.exec, code), 0),
-        "builtins.compile": call(g("builtins", "exec"), call(g("builtins", "compile"), s(code), s(""), s("exec")))
-        + STOP,
         "builtins.getattr": call(
             call(g("builtins", "getattr"), call(g("builtins", "__import__"), s("os")), s("system")), *run
         )
         + STOP,
         "builtins.open": call(g("builtins", "open"), s(str(mark)), s("w")) + STOP,
-        "builtins.map": call(
-            g("builtins", "list"), call(g("builtins", "map"), g("os", "system"), b"](" + s(shell) + b"e")
-        )
-        + STOP,
-        "builtins.type": call(g("builtins", "type"), s("X"), b")", b"}") + STOP,
-        "functools.partial called": call(call(g("functools", "partial"), g("os", "system")), *run) + STOP,
-        "functools.reduce": call(g("functools", "reduce"), g("builtins", "exec"), b"](" + s(code) + b"}e") + STOP,
         "operator.methodcaller": pickle.dumps(Reduced(operator.methodcaller, "system", shell)),
-        "timeit.timeit": call(g("timeit", "timeit"), s("pass"), s(code)) + STOP,
         "pickle.loads": call(g("pickle", "loads"), b(call(g("os", "system"), *run) + STOP)) + STOP,
         # allowed modules, other names
         "numpy.savetxt": call(g("numpy", "savetxt"), s(str(mark)), b"](K\x01e") + STOP,
-        "numpy.memmap": call(g("numpy", "memmap"), s(str(mark)), s("u1"), s("w+"), b"I0\n", b"I1\n") + STOP,
         "numpy.core.multiarray dotted": b"\x80\x04" + call(sg("numpy.core.multiarray", "os.system"), *run) + STOP,
-        "numpy.core.numeric dotted": b"\x80\x04" + call(sg("numpy._core.numeric", "sys.modules"), *run) + STOP,
-        "numpy.core.multiarray.__builtins__": g("numpy.core.multiarray", "__builtins__") + STOP,
-        "numpy.testing runstring": call(g("numpy.testing._private.utils", "runstring"), s(code), b"}") + STOP,
         "numpy.ndarray.tofile": b"\x80\x04" + call(sg("numpy", "ndarray.tofile"), EMPTY_ARRAY, s(str(mark))) + STOP,
-        "ndarray.tofile by getattr": call(call(g("builtins", "getattr"), EMPTY_ARRAY, s("tofile")), s(str(mark)))
-        + STOP,
         "ndarray called": call(NDARRAY, integer(10**9)) + STOP,
         "_reconstruct of a foreign class": call(RECONSTRUCT, g("subprocess", "Popen"), b"K\x00\x85", b(b"b")) + STOP,
-        "_reconstruct of a subclass": call(RECONSTRUCT, g("numpy", "memmap"), b"K\x00\x85", b(b"b")) + STOP,
         "_reconstruct of an inert class": call(RECONSTRUCT, g("chumpy", "Ch"), b"K\x00\x85", b(b"b")) + STOP,
         # copyreg
         "copyreg._reconstructor of dict": call(
             g("copyreg", "_reconstructor"), g("builtins", "dict"), g("builtins", "object"), b"N"
-        )
-        + STOP,
-        "copyreg._reconstructor of Popen": call(
-            g("copy_reg", "_reconstructor"), g("subprocess", "Popen"), g("__builtin__", "object"), b"N"
         )
         + STOP,
         "copyreg._reconstructor of an allowed name": call(
@@ -177,53 +131,33 @@ def programs(mark: Path) -> dict[str, bytes]:
         # BUILD
         "BUILD on a module": g("os", "path") + b"}" + s("x") + b"Nsb" + STOP,
         "BUILD on a reader's function": RECONSTRUCT + b"}" + s("__code__") + b"Nsb" + STOP,
-        "BUILD on a reader's function, slots": RECONSTRUCT + b"N}" + s("__defaults__") + b")s\x86b" + STOP,
-        "BUILD with __dict__": call(g("builtins", "object")) + b"}" + s("__dict__") + b"}sb" + STOP,
         "BUILD with __class__": dtype("f8") + b"N}" + s("__class__") + g("os", "system") + b"s\x86b" + STOP,
-        "BUILD on a dictionary": b"}}" + s("a") + b"Nsb" + STOP,
         "BUILD with __setstate__": b"]}" + s("__setstate__") + g("os", "system") + b"sb" + s(shell) + b"b" + STOP,
-        "BUILD by pickle": pickle.dumps(WithState(functools.partial, (os.system,), (os.system, (shell,), {}, {}))),
         # opcodes
         "EXT1": b"\x80\x02\x82\xf0" + s(shell) + b"\x85R" + STOP,
         "EXT2": b"\x80\x02\x83\xf0\x00" + s(shell) + b"\x85R" + STOP,
         "EXT4": b"\x80\x02\x84\xf0\x00\x00\x00" + s(shell) + b"\x85R" + STOP,
         "INST": b"(" + s(shell) + b"ios\nsystem\n" + STOP,
-        "INST of Popen": b"(](" + s("touch") + s(str(mark)) + b"eisubprocess\nPopen\n" + STOP,
         "OBJ": b"(" + g("subprocess", "Popen") + b"](" + s("touch") + s(str(mark)) + b"eo" + STOP,
-        "OBJ of a text": b"(" + s("os") + s(shell) + b"o" + STOP,
         "NEWOBJ": g("subprocess", "Popen") + b")\x81" + STOP,
-        "NEWOBJ of a reader's function": RECONSTRUCT + b")\x81" + STOP,
         "NEWOBJ_EX": g("subprocess", "Popen") + b")}\x92" + STOP,
         "NEWOBJ_EX of an inert class": g("chumpy", "Ch") + b")}\x92" + STOP,
         "PERSID": b"P" + code.encode() + b"\n" + STOP,
         "BINPERSID": s(code) + b"Q" + STOP,
         "NEXT_BUFFER": b"\x80\x05\x97" + STOP,
         "READONLY_BUFFER": b"\x80\x05N\x98" + STOP,
-        "STACK_GLOBAL dotted": b"\x80\x04" + call(sg("builtins", "str.format"), s("{0.__class__}"), b"N") + STOP,
         "STACK_GLOBAL of os": b"\x80\x04" + call(sg("os", "path.os.system"), *run) + STOP,
         "STACK_GLOBAL without texts": b"\x80\x04NN\x93" + STOP,
-        "GLOBAL dotted in protocol 4": b"\x80\x04" + call(g("builtins", "object.__subclasses__")) + STOP,
-        "GLOBAL dotted in an allowed name": b"\x80\x04" + g("numpy", "dtype.__init__.__globals__") + STOP,
-        "REDUCE of a text": s("os.system") + b")R" + STOP,
         "REDUCE of a foreign object": call(call(g("chumpy", "Ch")), *run) + STOP,
         # codecs
-        "codecs.decode": pickle.dumps(Reduced(codecs.decode, b"x\x9c\x03\x00\x00\x00\x00\x01", "zlib")),
         "_codecs.encode to rot13": call(g("_codecs", "encode"), s("a"), s("rot13")) + STOP,
-        "_codecs.encode of bytes": call(g("_codecs", "encode"), b(b"a"), s("latin1")) + STOP,
         # torch
-        "torch.storage._load_from_bytes": call(g("torch.storage", "_load_from_bytes"), b(b"\x80\x02" + code.encode()))
-        + STOP,
         # packages with names like the inert ones
         "chumpyx": call(g("chumpyx", "system"), *run) + STOP,
-        "scipy": call(g("scipy", "LowLevelCallable"), *run) + STOP,
         # reader's own names as values
         "a function as value": RECONSTRUCT + STOP,
         "a function in a set": call(g("builtins", "set"), b"](" + RECONSTRUCT + b"e") + STOP,
-        "a function in a frozenset": b"\x80\x04(" + RECONSTRUCT + b"\x91" + STOP,
         "a function as key": b"}" + RECONSTRUCT + b"Ns" + STOP,
-        "a class in a set": b"\x80\x04\x8f(" + g("chumpy", "Ch") + b"\x90" + STOP,
-        "a class as key": b"(" + g("chumpy", "Ch") + b"Nd" + STOP,
-        "a token as key": b"}(" + NDARRAY + b"Nu" + STOP,
         "an unfinished array as key": b"}" + EMPTY_ARRAY + b"Ns" + STOP,
         "a function in an object array": array(b"K\x01\x85", dtype("O8"), b"](" + RECONSTRUCT + b"e") + STOP,
         "a function in a foreign state": call(g("chumpy", "Ch")) + b"}" + s("x") + RECONSTRUCT + b"sb" + STOP,
@@ -282,10 +216,8 @@ def test_programs_are_refused_and_do_nothing(name, tmp_path):
 
 
 RUNNABLE = (
-    *("os.system", "posix.system", "builtins.eval", "builtins.exec", "builtins.compile", "builtins.getattr"),
-    *("builtins.open", "builtins.map", "functools.partial called", "functools.reduce", "operator.methodcaller"),
-    *("subprocess.run", "timeit.timeit", "pickle.loads", "numpy.savetxt", "numpy.memmap", "numpy.ndarray.tofile"),
-    *("numpy.testing runstring", "ndarray.tofile by getattr", "EXT1", "EXT2", "EXT4", "INST", "STACK_GLOBAL of os"),
+    *("os.system", "builtins.eval", "builtins.getattr", "builtins.open", "operator.methodcaller", "pickle.loads"),
+    *("numpy.savetxt", "numpy.ndarray.tofile", "EXT1", "EXT2", "EXT4", "INST", "STACK_GLOBAL of os"),
 )
 
 
@@ -318,15 +250,8 @@ def bombs() -> dict[str, bytes]:
     n = 20_000
     return {
         "tuples": laughs + STOP,
-        "lists": nested_pairs(LEVELS, "list") + STOP,
-        "tuples in a list": b"](" + laughs + b"e" + STOP,
         "tuples as a shape": laughs + KEY[0] + array(KEY[1], dtype("f8"), b(b"")) + STOP,
-        "tuples as a dtype": laughs + KEY[0] + call(DTYPE, KEY[1]) + STOP,
-        "tuples as array data": laughs + KEY[0] + array(b"K\x01\x85", dtype("O8"), b"](" + KEY[1] + b"e") + STOP,
-        "tuples as attributes": call(g("chumpy", "Ch")) + b"}" + s("x") + laughs + b"sb" + STOP,
-        "tuples as a state": laughs + KEY[0] + call(g("chumpy", "Ch")) + KEY[1] + b"b" + KEY[1] + b"\x86" + STOP,
         "a deep tuple": b")" + b"\x85" * 150_000 + STOP,
-        "a deep list": b"]" * 150_000 + b"a" * 149_999 + STOP,
         "deep foreign objects": b"".join(
             (call(g("chumpy", "Ch")), (b"}" + s("x") + call(g("chumpy", "Ch"))) * 5000, b"sb" * 5000)
         )
@@ -345,18 +270,13 @@ def bombs() -> dict[str, bytes]:
         + b"e"
         + STOP,
         "BINBYTES8": b"\x80\x04\x8e" + struct.pack("<Q", 2**60) + b"abc" + STOP,
-        "BINUNICODE8": b"\x80\x04\x8d" + struct.pack("<Q", 2**60) + b"abc" + STOP,
         "BYTEARRAY8": b"\x80\x05\x96" + struct.pack("<Q", 2**60) + b"abc" + STOP,
-        "BINBYTES8 beyond": b"\x80\x04\x8e" + b"\xff" * 8 + b"abc" + STOP,
         "FRAME": b"\x80\x04\x95" + struct.pack("<Q", 2**60) + b"N" + STOP,
-        "LONG4": b"\x8b\xff\xff\xff\x7fabc" + STOP,
         "LONG of many digits": b"L" + b"9" * 10**6 + b"L\n" + STOP,
         "LONG_BINPUT": b"Nr\xff\xff\xff\xff" + b"j\xfe\xff\xff\xff" + STOP,
         "PUT": b"Np" + b"9" * 4000 + b"\n" + b"g1\n" + STOP,
         "a shape of 2**40": array(integer(2**40) + b"\x85", dtype("f8"), b(b"")) + STOP,
         "a shape of objects": array(integer(2**40) + b"\x85", dtype("O8"), b"]") + STOP,
-        "a shape of nothing": array(integer(2**40) + b"\x85", dtype("S0"), b(b"")) + STOP,
-        "a shape of empty texts": array(integer(2**33) + b"\x85", dtype("U0"), b(b"")) + STOP,
         "a shape of 100 dimensions": array(b"(" + b"K\x01" * 100 + b"t", dtype("f8"), b(bytes(8))) + STOP,
         "a negative shape": array(integer(-1) + b"\x85", dtype("f8"), b(bytes(8))) + STOP,
         "a shape that is none": array(s("(1,)"), dtype("f8"), b(bytes(8))) + STOP,
@@ -364,10 +284,6 @@ def bombs() -> dict[str, bytes]:
         "a scalar of a huge dtype": call(g("numpy.core.multiarray", "scalar"), dtype(f"U{2**28}"), b(b"")) + STOP,
         # structure
         "a structured dtype": array(b"K\x01\x85", dtype("f8,f8"), b(bytes(16))) + STOP,
-        "a structured dtype by a list": array(
-            b"K\x01\x85", call(DTYPE, b"](" + s("a") + s("O") + b"\x86e"), b(bytes(8))
-        )
-        + STOP,
         "a structured dtype by BUILD": array(
             b"K\x01\x85", dtype("V8") + b"(K\x03" + s("|") + b"N" + s("a") + b"\x85}I8\nI1\nK\x00tb", b(bytes(8))
         )
@@ -444,13 +360,8 @@ def harmless() -> dict[str, bytes]:
         + s("os.system")
         + b"sb"
         + STOP,
-        "chumpy with __class__": call(g("chumpy.ch", "Ch")) + b"N}" + s("__class__") + s("os") + b"s\x86b" + STOP,
-        "chumpy with __reduce__": g("chumpy.ch", "Ch") + b")\x81}" + s("__reduce__") + s("os") + b"sb" + STOP,
         "a dotted name in an inert package": b"\x80\x04" + call(sg("chumpy", "os.system"), s("true")) + STOP,
-        "a dunder name in an inert package": call(g("scipy.sparse", "__builtins__"), s("true")) + STOP,
-        "a foreign class called with much": call(g("chumpy.ch", "Ch"), s("a"), b"N", b"]", b"}") + STOP,
         "more after the end": b"N" + STOP + call(g("os", "system"), s("true")) + STOP,
-        "a flat list of many": b"](" + b"K\x01" * 200_000 + b"e" + STOP,
         "one list in a list, often": b"](" + b"N" * 100 + b"e" + put(1) + b"0](" + get(1) * 50_000 + b"e" + STOP,
         "keys of every plain kind": b"}("
         + s("a")
@@ -462,7 +373,6 @@ def harmless() -> dict[str, bytes]:
         + s("x")
         + b"\x86Nu"
         + STOP,
-        "structured text": s("__import__('os').system('true')") + STOP,
     }
 
 
@@ -529,27 +439,18 @@ def headers() -> dict[str, bytes]:
     return {
         "a shape of 2**40": npy_header(usual | {"shape": (2**40,)}) + bytes(8),
         "a shape of 2**40 objects": npy_header(usual | {"shape": (2**40,), "descr": "|O"}) + b"]" + STOP,
-        "a shape of nothing": npy_header(usual | {"shape": (2**33,), "descr": "|S0"}),
         "a shape of empty texts": npy_header(usual | {"shape": (2**60,), "descr": "<U0"}),
         "a shape of void": npy_header(usual | {"shape": (2**60,), "descr": "|V0"}),
-        "an empty giant": npy_header(usual | {"shape": (0, 10**20)}),
         "an empty giant that fits": npy_header(usual | {"shape": (0, 2**62)}),
         "a negative shape": npy_header(usual | {"shape": (-1,)}) + bytes(8),
-        "negative shapes": npy_header(usual | {"shape": (-2, -3)}) + bytes(48),
         "a shape of truth": npy_header(usual | {"shape": (True,)}) + bytes(8),
-        "100 dimensions": npy_header(usual | {"shape": (1,) * 100}) + bytes(8),
         "a subarray": npy_header(usual | {"descr": ("<f8", (2,))}) + bytes(16),
         "an object in a structure": npy_header(usual | {"descr": [("a", "|O")]}) + bytes(8),
-        "mixed keys": npy_header("{'descr': '<f8', 1: False, 'shape': (1,)}") + bytes(8),
         "a call": npy_header("{'descr': __import__('os').system('true'), 'fortran_order': False, 'shape': ()}"),
         "many signs": npy_header("{'descr': '<f8', 'fortran_order': False, 'shape': (" + "-" * 9000 + "1,)}"),
-        "many brackets": npy_header("{'descr': " + "(" * 4000 + ")" * 4000 + "}"),
-        "an open string": npy_header('{\'descr\': os(, """ '),
-        "a backslash": npy_header("{'descr': '<f8', 'shape': (1L,)\n  \\"),
         "a power": npy_header("{'descr': '<f8', 'fortran_order': False, 'shape': (9**9**9,)}"),
         "a huge descr": npy_header(usual | {"descr": "<U99999999999"}),
         "a header of another length": b"\x93NUMPY\x01\x00\xff\xff{}",
-        "another version": b"\x93NUMPY\x09\x00\x02\x00{}",
     }
 
 

@@ -173,21 +173,9 @@ REFUSED = {
     "empty": (raw(b""), "a.png", "empty"),
     "a web page": (raw(b"<html>404</html>"), "a.png", "web page"),
     "a pointer": (raw(b"version https://git-lfs.github.com/spec/v1\n"), "a.png", "git lfs pull"),
-    "a bomb": (
-        claims(60000, 60000),
-        "a.png",
-        "pixels",
-    ),
-    "a smaller bomb": (
-        claims(12000, 12000),
-        "a.png",
-        "12000×12000 px",
-    ),
-    "no pixels": (
-        claims(0, 4),
-        "a.png",
-        "image",
-    ),
+    "a bomb": (claims(60000, 60000), "a.png", "pixels"),
+    "a smaller bomb": (claims(12000, 12000), "a.png", "12000×12000 px"),
+    "no pixels": (claims(0, 4), "a.png", "image"),
     "a folder": (lambda p: p.mkdir(), "a.png", "folder"),
     "a pipe": (os.mkfifo, "a.png", "no regular file"),
 }

@@ -4,43 +4,8 @@ import numpy as np
 import pytest
 
 from ihbench.errors import BadInput
-from ihbench.files import safe_pickle
 from ihbench.files.safe_pickle import ForeignObject, load_npy, load_pickle
 from tests.body.python2_pickle import Instance, dumps
-
-
-@pytest.mark.parametrize(
-    "attack",
-    [
-        # attributes of what the reader itself can call
-        b"cnumpy.core.multiarray\n_reconstruct\n(N(dS'__defaults__'\n(I1\ntstb.",
-        b"cnumpy\nndarray\n(N(dS'__call__'\nI1\nstb.",
-        b"cnumpy\ndtype\n(dS'resolve'\nI1\nsb.",
-        b"cchumpy.ch\nCh\n(N(dS'__new__'\nI1\nstb.",
-        # a class or function as a value
-        b"cnumpy\ndtype\n.",
-        b"cnumpy\nndarray\n.",
-        b"ccopy_reg\n_reconstructor\n.",
-        # wrong classes for the constructors
-        b"ccopy_reg\n_reconstructor\n(cnumpy\ndtype\nc__builtin__\nobject\nNtR.",
-        b"cnumpy.core.multiarray\n_reconstruct\n(cchumpy.ch\nCh\n(I0\ntS'b'\ntR.",
-        b"c_codecs\nencode\n(S'abc'\nS'rot13'\ntR.",
-        # opcodes no data file needs
-        b"Pid\n.",
-        b"S'id'\nQ.",
-        b"\x80\x05\x97.",
-        # structured and object scalars
-        b"cnumpy.core.multiarray\nscalar\n(cnumpy\ndtype\n(S'O8'\nI0\nI1\ntRS'12345678'\ntR.",
-        b"cnumpy.core.multiarray\nscalar\n(cnumpy\ndtype\n(S'V8'\nI0\nI1\ntRS'12345678'\ntR.",
-        b"cnumpy\ndtype\n(S'f8'\nI0\nI1\ntR(I3\nS'<'\n(S'f8'\n(I9\nttNNI-1\nI-1\nI0\ntb.",
-    ],
-)
-def test_trickery_with_allowed_names_is_refused(attack, tmp_path):
-    file = tmp_path / "trick.pkl"
-    file.write_bytes(attack)
-    with pytest.raises(BadInput, match=r"trick\.pkl"):
-        load_pickle(file)
-    assert safe_pickle._reconstruct.__defaults__ is None
 
 
 @pytest.mark.parametrize("content", [b"", b".", b"hello", b"\x80\x04", b"PK\x03\x04" * 9])
@@ -166,18 +131,3 @@ def test_npy_of_numbers_reads_like_numpy(array, tmp_path):
     value = load_npy(file)
     np.testing.assert_array_equal(value, array)
     assert value.dtype == array.dtype
-
-
-def test_npy_headers_that_promise_too_much_are_bad_input(tmp_path):
-    file = tmp_path / "giant.npy"
-    for shape, dtype in (((10**13,), "<f8"), ((10**12,), "|O"), ((4,), "<f8")):
-        with file.open("wb") as stream:
-            header = {"descr": dtype, "fortran_order": False, "shape": shape}
-            np.lib.format.write_array_header_1_0(stream, header)
-            stream.write(pickle.dumps(np.zeros(1, object)) if dtype == "|O" else b"12345678" * 3)
-        with pytest.raises(BadInput, match=r"giant\.npy"):
-            load_npy(file)
-    for content in (b"", b"\x93NUMPY", b"\x93NUMPY\x01\x00\x10\x00{'descr': os}   ", b"text"):
-        file.write_bytes(content)
-        with pytest.raises(BadInput, match=r"giant\.npy"):
-            load_npy(file)

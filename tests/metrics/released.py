@@ -114,10 +114,7 @@ def humannerf(pred, truth, masks, background=1.0):
 def occnerf(pred, truth, masks, background=1.0):
     x, y = in_8_bits_inside_the_box(pred, truth, masks, background)
     scalar, full = old_skimage(x, y, full=True)
-    out = {
-        "psnr/occnerf-pooled/range1/full/v1": decibels(x, y),
-        "ssim/occnerf-uniform7-map/range2/full/v1": scalar,
-    }
+    out = {"psnr/occnerf-pooled/range1/full/v1": decibels(x, y), "ssim/occnerf-uniform7-map/range2/full/v1": scalar}
     for region in ("body", "visible", "box+0.3"):
         out[f"psnr/occnerf-pooled/range1/{region}/v1"] = decibels(x[masks[region]], y[masks[region]])
         out[f"ssim/occnerf-uniform7-map/range2/{region}/v1"] = full[masks[region]].mean()

@@ -11,7 +11,6 @@ from concurrent.futures import ThreadPoolExecutor
 import flip_evaluator
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -107,15 +106,6 @@ def test_equals_the_official_evaluator(shape, ppd):
     np.testing.assert_allclose(flip_map(pred, truth, ppd=ppd), official(pred, truth, ppd), rtol=0, atol=FLOAT32)
 
 
-def test_equals_the_official_evaluator_on_a_person_like_frame():
-    mask = disc((120, 100))
-    pred, truth = (np.where(mask[..., None], image, 1.0) for image in pair((120, 100)))
-    expected = official(pred, truth)
-    np.testing.assert_allclose(flip_map(pred, truth), expected, rtol=0, atol=FLOAT32)
-    assert flip(pred, truth) == pytest.approx(expected.mean(), abs=1e-5)
-    assert flip(pred, truth, mask) == pytest.approx(expected[mask].mean(), abs=1e-5)
-
-
 def test_default_viewing_distance_is_the_official_one():
     images = [image.astype(np.float32) for image in pair((4, 4))]
     parameters = flip_evaluator.evaluate(*images, "LDR")[2]
@@ -145,44 +135,6 @@ def test_reference_values():
     )
 
 
-def flat_color_difference(x, y):
-    """FLIP of two flat images: no filter changes them, and there is no feature."""
-
-    def lab(color):
-        r, g, b = (c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in color)
-        xyz = (
-            (10135552 * r + 8788810 * g + 4435075 * b) / (10135552 + 8788810 + 4435075),
-            (2613072 * r + 8788810 * g + 887015 * b) / (2613072 + 8788810 + 887015),
-            (1425312 * r + 8788810 * g + 70074185 * b) / (1425312 + 8788810 + 70074185),
-        )
-        fx, fy, fz = (t ** (1 / 3) if t > 216 / 24389 else (24389 / 27 * t + 16) / 116 for t in xyz)
-        lightness = 116 * fy - 16
-        return lightness, lightness / 100 * 500 * (fx - fy), lightness / 100 * 200 * (fy - fz)
-
-    def distance(x, y):
-        (a, b, c), (d, e, f) = lab(x), lab(y)
-        return (abs(a - d) + math.hypot(b - e, c - f)) ** 0.7
-
-    share = distance(x, y) / distance((0, 1, 0), (0, 0, 1))
-    return share / 0.4 * 0.95 if share < 0.4 else 0.95 + (share - 0.4) / 0.6 * 0.05
-
-
-@pytest.mark.parametrize(
-    ("x", "y"),
-    [
-        ((0, 0, 0), (1, 1, 1)),
-        ((0.2, 0.2, 0.2), (0.21, 0.2, 0.2)),
-        ((0, 1, 0), (0, 0, 1)),
-        ((1, 0, 0), (0, 1, 1)),
-        ((0.01, 0.02, 0.03), (0.03, 0.01, 0.02)),
-        ((0.6, 0.4, 0.3), (0.5, 0.4, 0.35)),
-    ],
-)
-def test_flat_images_have_a_closed_form(x, y):
-    values = flip_map(*(np.broadcast_to(np.array(color, np.float64), (25, 200, 3)) for color in (x, y)))
-    np.testing.assert_allclose(values, flat_color_difference(x, y), rtol=0, atol=1e-12)
-
-
 def test_the_ends_of_the_scale():
     black, white = np.zeros((30, 30, 3), np.uint8), np.full((30, 30, 3), 255, np.uint8)
     # lightness alone makes black and white the largest difference of greys, but green and blue are further apart
@@ -190,13 +142,6 @@ def test_the_ends_of_the_scale():
     green, blue = black.copy(), black.copy()
     green[..., 1] = blue[..., 2] = 255
     assert flip(green, blue) == pytest.approx(1.0, abs=1e-12)
-
-
-def test_identical_is_exactly_zero():
-    pred, _ = pair((33, 21))
-    assert flip(pred, pred.copy()) == 0.0
-    assert flip(pred, pred.copy(), disc((33, 21))) == 0.0
-    assert (flip_map(pred, pred.copy()) == 0.0).all()
 
 
 def test_leaving_out_equal_windows_changes_nothing():
@@ -286,14 +231,6 @@ def test_a_mask_of_one_pixel(where, background):
     assert value > 0.05
 
 
-def test_values_outside_the_range_are_clipped():
-    pred, truth = pair((20, 24))
-    pred[3:9], truth[5:12] = 7.5, -2.0
-    expected = flip_map(np.clip(pred, 0, 1), np.clip(truth, 0, 1))
-    np.testing.assert_array_equal(flip_map(pred, truth, hdr=True), expected)
-    assert flip(np.full((9, 9, 3), 1.0), np.full((9, 9, 3), 1e30), hdr=True) == 0.0
-
-
 @given(st.integers(0, 10_000), st.floats(0, 1))
 @settings(deadline=None, derandomize=True, max_examples=30)
 def test_bounds_and_symmetries(seed, noise):
@@ -304,38 +241,6 @@ def test_bounds_and_symmetries(seed, noise):
     assert flip(pred[::-1], truth[::-1]) == pytest.approx(value, abs=1e-9)  # also: views that are not contiguous
     assert flip(pred[:, ::-1], truth[:, ::-1]) == pytest.approx(value, abs=1e-9)
     assert flip(pred.swapaxes(0, 1), truth.swapaxes(0, 1)) == pytest.approx(value, abs=1e-9)
-
-
-def test_a_larger_error_is_a_larger_number():
-    truth = np.full((30, 30, 3), 0.5)
-    patches = [truth.copy() for _ in range(4)]
-    for step, patch in enumerate(patches):
-        patch[10:20, 10:20] += 0.1 * step
-    values = [flip(patch, truth) for patch in patches]
-    assert values == sorted(set(values))
-
-
-@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
-def test_inputs_are_left_alone_and_may_be_read_only_or_tensors(dtype):
-    pred, truth = of_dtype(pair((21, 22)), dtype)
-    mask, copies = disc((21, 22)), (pred.copy(), truth.copy())
-    value = flip(pred, truth, mask)
-    for image in (pred, truth, mask):
-        image.flags.writeable = False
-    assert flip(pred, truth, mask) == value
-    assert flip(np.asfortranarray(pred), truth, mask) == value
-    assert flip(*(torch.tensor(image) for image in (pred, truth, mask))) == value
-    wide = np.zeros((21, 44, 6), dtype)
-    wide[:, ::2, ::2] = pred
-    assert flip(wide[:, ::2, ::2], truth, mask) == value
-    np.testing.assert_array_equal((pred, truth), copies)
-
-
-def test_grey_is_three_equal_channels():
-    pred, truth = (image[..., 0] for image in pair((21, 22)))
-    colors = [np.repeat(image[..., None], 3, 2) for image in (pred, truth)]
-    assert flip(pred, truth, disc((21, 22))) == flip(*colors, disc((21, 22)))
-    np.testing.assert_array_equal(flip_map(pred, truth), flip_map(*colors))
 
 
 def test_differing_pixels_can_be_shared_and_threads_do_not_disturb_each_other():
@@ -355,17 +260,6 @@ def test_importing_it_costs_numpy_only():
     code = f"import sys, ihbench.metrics.flip; print([name for name in {heavy} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
-
-
-def test_mismatches_are_refused():
-    with pytest.raises(ValueError, match=r"\(4, 4, 3\).*\(5, 4, 3\)"):
-        flip(np.zeros((4, 4, 3)), np.zeros((5, 4, 3)))
-    with pytest.raises(ValueError, match=r"float64.*uint8"):
-        flip_map(np.zeros((4, 4, 3)), np.zeros((4, 4, 3), np.uint8))
-    with pytest.raises(ValueError, match=r"\[H, W, 3\].*\(4, 4, 4\)"):
-        flip(np.zeros((4, 4, 4)), np.zeros((4, 4, 4)))
-    with pytest.raises(ValueError, match="mask"):
-        flip(np.zeros((4, 4, 3)), np.zeros((4, 4, 3)), np.ones((4, 5), bool))
 
 
 @pytest.mark.parametrize("ppd", [0.0, -3.0, 0.5, math.inf, math.nan])

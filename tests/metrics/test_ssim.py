@@ -127,18 +127,6 @@ def test_reference_values():
     )
 
 
-def test_flat_images_have_a_closed_form():
-    x, y = 0.25, 0.75
-    expected = (2 * x * y + 1e-4) / (x * x + y * y + 1e-4)
-    assert ssim(np.full((20, 20, 3), x), np.full((20, 20, 3), y)) == pytest.approx(expected, abs=1e-13)
-
-
-def test_identical_is_exactly_one():
-    pred, _ = pair((33, 21, 3))
-    assert ssim(pred, pred.copy()) == 1.0
-    assert (ssim_map(pred, pred.copy()) == 1.0).all()
-
-
 def test_leaving_out_equal_windows_changes_nothing():
     truth = np.ones((200, 150, 3))
     pred = truth.copy()
@@ -189,12 +177,6 @@ def test_bad_pixels_that_agree_are_not_taken_for_equal_windows(bad):
     assert math.isnan(ssim(image, image.copy()))
 
 
-def test_empty_mask_and_empty_image_are_nan():
-    pred, truth = pair((8, 8, 3))
-    assert math.isnan(ssim(pred, truth, np.zeros((8, 8), bool)))
-    assert math.isnan(ssim(np.zeros((0, 3, 3)), np.zeros((0, 3, 3))))
-
-
 @pytest.mark.parametrize("where", [(0, 0), (7, 3), (19, 19)])
 def test_a_mask_of_one_pixel(where):
     pred, truth = pair((20, 20, 3), noise=0.4)
@@ -237,10 +219,3 @@ def test_bounds_and_symmetries(seed, noise):
 def test_a_window_without_a_centre_or_width_is_refused(options):
     with pytest.raises(ValueError, match="window"):
         ssim(np.zeros((4, 4)), np.zeros((4, 4)), **options)
-
-
-def test_mismatches_are_refused():
-    with pytest.raises(ValueError, match=r"\(4, 4, 3\).*\(5, 4, 3\)"):
-        ssim(np.zeros((4, 4, 3)), np.zeros((5, 4, 3)))
-    with pytest.raises(ValueError, match=r"float64.*uint8"):
-        ssim_map(np.zeros((4, 4, 3)), np.zeros((4, 4, 3), np.uint8))

@@ -164,11 +164,7 @@ def test_metric_names_after_numbers_begin_another_table():
 
 
 @pytest.mark.parametrize(
-    "opening",
-    [
-        r"\begin{tabular*}{\linewidth}{@{\extracolsep{\fill}}lc}",
-        r"\begin{tabularx}{\linewidth}[t]{lX}",
-    ],
+    "opening", [r"\begin{tabular*}{\linewidth}{@{\extracolsep{\fill}}lc}", r"\begin{tabularx}{\linewidth}[t]{lX}"]
 )
 def test_other_environments_are_tables_too(opening):
     name = opening.split("{")[1].split("}")[0]

@@ -67,8 +67,7 @@ def person_case(height: int = 24, width: int = 22, dtype: type = np.float32, see
 def _rectangle(mask: NDArray[np.bool_], margin: int) -> NDArray[np.bool_]:
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     out = np.zeros_like(mask)
-    out[
-        max(rows[0] - margin, 0) : rows[-1] + margin + 1,
-        max(columns[0] - margin, 0) : columns[-1] + margin + 1,
-    ] = True
+    out[max(rows[0] - margin, 0) : rows[-1] + margin + 1, max(columns[0] - margin, 0) : columns[-1] + margin + 1] = (
+        True
+    )
     return out
