@@ -19,16 +19,18 @@ from ihbench.bounds import SEEDS
 from ihbench.clock.progress import Progress
 from ihbench.commands.options.device import check_device
 from ihbench.commands.options.keep import check_keep
-from ihbench.commands.options.scene_choice import OcclusionChoice, ProtocolChanges
+from ihbench.commands.options.scene_choice import NO_CHOICE, OcclusionChoice, ProtocolChanges
+from ihbench.config_fields import replaced
 from ihbench.errors import BadInput
 from ihbench.files.paths import user_path
 from ihbench.record.results import RunResult
-from ihbench.scene.protocol import Protocol, load_protocol
+from ihbench.scene.protocol import CHOICES, Protocol, load_protocol
 
 if TYPE_CHECKING:
     from ihbench.body import Body
     from ihbench.scene.views import OccludedScene
 
+Choices = Mapping[str, Any] | None  # of the protocol, by name: {"image.edge": "soft"}
 Occlusion = str | Mapping[str, Any] | None  # a rule's name, or rule, fraction, covers as on the command line
 
 
@@ -79,6 +81,7 @@ def run(
     train_frames: str | None = None,
     test_frames: str | None = None,
     occlusion: Occlusion = None,
+    choices: Choices = None,
     progress: Progress | None = None,
     **switches: Any,
 ) -> RunResult:
@@ -86,8 +89,8 @@ def run(
     configuration (`**{"inpaint.on": False}` for those of a part).
 
     `train_frames` and `test_frames` are "START:STOP:STEP"; `occlusion` is a rule's name, or a mapping with any of
-    "rule", "fraction" and "covers". Raises `BadInput` for anything the caller got wrong. Divergence and failure are
-    statuses of the result.
+    "rule", "fraction" and "covers"; `choices` has any other choice of the protocol. Raises `BadInput` for anything
+    the caller got wrong. Divergence and failure are statuses of the result.
     """
     for name, value in (("scene", scene), ("seed", seed)):
         if isinstance(value, list | tuple | set | range | np.ndarray) and np.ndim(list(value)):
@@ -98,7 +101,7 @@ def run(
         _RunArguments,
         dict(protocol=protocol, scene=scene, method=method, profile=profile, data=data, runs=runs, body=body,
              seed=seed, device=device, force=force, keep=keep, progress=progress),
-        dict(image_size=image_size, train_frames=train_frames, test_frames=test_frames), occlusion,
+        dict(image_size=image_size, train_frames=train_frames, test_frames=test_frames), occlusion, choices,
     )  # fmt: skip
     from ihbench.runner.run_loop import RunRequest, configuration, run_scene
     from ihbench.scene.data_source import locate
@@ -124,6 +127,7 @@ def load_scene(
     train_frames: str | None = None,
     test_frames: str | None = None,
     occlusion: Occlusion = None,
+    choices: Choices = None,
     progress: Progress | None = None,
 ) -> tuple[OccludedScene, Body]:
     """Training and test views of one scene under a protocol, loaded lazily, and the body model of its poses.
@@ -133,7 +137,7 @@ def load_scene(
     given = _given(
         _SceneArguments,
         dict(protocol=protocol, scene=scene, profile=profile, data=data, body=body, progress=progress),
-        dict(image_size=image_size, train_frames=train_frames, test_frames=test_frames), occlusion,
+        dict(image_size=image_size, train_frames=train_frames, test_frames=test_frames), occlusion, choices,
     )  # fmt: skip
     from ihbench.scene.data_source import locate
     from ihbench.scene.views import open_scene
@@ -175,6 +179,7 @@ def ablate(
     train_frames: str | None = None,
     test_frames: str | None = None,
     occlusion: Occlusion = None,
+    choices: Choices = None,
     progress: Progress | None = None,
 ) -> Ablation:
     """What each component of a method is worth, as `ihbench ablate` does: a registered ladder, or a grid `vary` of
@@ -195,7 +200,7 @@ def ablate(
         dict(protocol=protocol, scene=_several(scene), method=method, profile=profile, data=data, runs=runs,
              body=body, ladder=ladder, keep=keep, seed=_several(seed), device=device, workers=workers,
              share=share, out=out),
-        dict(image_size=image_size, train_frames=train_frames, test_frames=test_frames), occlusion,
+        dict(image_size=image_size, train_frames=train_frames, test_frames=test_frames), occlusion, choices,
     )  # fmt: skip
     told = _progress(progress)
     fixed = {name: _plain(value) for name, value in (switches or {}).items()}
@@ -227,6 +232,7 @@ def score(
     train_frames: str | None = None,
     test_frames: str | None = None,
     occlusion: Occlusion = None,
+    choices: Choices = None,
     progress: Progress | None = None,
 ) -> list[RunResult]:
     """Score a folder of images that somebody else's code rendered, as `ihbench score` does: a result for each scene.
@@ -240,12 +246,14 @@ def score(
         ScoreOptions,
         dict(predictions=predictions, protocol=protocol, scene=_several(scene), prepared=prepared, name=name,
              pattern=pattern, alpha=alpha, profile=profile, data=data, runs=runs, body=body, force=force),
-        dict(image_size=image_size, train_frames=train_frames, test_frames=test_frames), occlusion,
+        dict(image_size=image_size, train_frames=train_frames, test_frames=test_frames), occlusion, choices,
     )  # fmt: skip
     return scored(given, _progress(progress))
 
 
-def _given(kind: type[Any], values: dict[str, Any], changes: dict[str, Any], occlusion: Occlusion) -> Any:
+def _given(
+    kind: type[Any], values: dict[str, Any], changes: dict[str, Any], occlusion: Occlusion, choices: Choices
+) -> Any:
     """The options, checked. Raises `BadInput` under the argument's own name."""
     values, known = {**values, **changes}, {f.name: str(f.type) for f in fields(kind)}
     if "progress" in values:
@@ -255,7 +263,7 @@ def _given(kind: type[Any], values: dict[str, Any], changes: dict[str, Any], occ
         if isinstance(value, str | os.PathLike):
             value = user_path(value, name) if "Path" in known[name] else os.fspath(value)
         values[name] = value
-    given = kind(**values, occlusion=_occlusion(occlusion))
+    given = kind(**values, occlusion=_occlusion(occlusion), choices=_choices(choices))
     bounds.check(given, "")
     return given
 
@@ -281,6 +289,16 @@ def _occlusion(value: Occlusion) -> OcclusionChoice:
     if isinstance(fraction, tuple):
         raise BadInput(f"occlusion.fraction {bounds.shown(fraction)}: expected one number; call once for each")
     return OcclusionChoice(plain.get("rule"), () if fraction is None else (fraction,), plain.get("covers"))
+
+
+def _choices(value: Choices) -> Any:
+    given = {} if value is None else value
+    if not isinstance(given, Mapping):
+        raise BadInput(f"choices {bounds.shown(value)}: expected a mapping from a protocol's choices to their values")
+    for name in given:
+        if name not in CHOICES:
+            raise BadInput(f"choices {name!r}: {registry.nearest(str(name), list(CHOICES))}")
+    return replaced(NO_CHOICE, {name: _plain(part) for name, part in given.items()})
 
 
 def _several(value: Any) -> Any:

@@ -103,7 +103,7 @@ def check(values: Any, prefix: str = "--", only: Collection[str] | None = None) 
         for item in value if isinstance(value, tuple | list) else (value,):
             if isinstance(item, str) and not item and default != "":
                 raise BadInput(f"{flag} '': expected a name, found no text")
-            bounds = rules(hint) or (ANY_NUMBER,)
+            bounds = tuple(dict.fromkeys(rules(hint))) or (ANY_NUMBER,)
             if isinstance(item, int | float) and not isinstance(item, bool):
                 for rule in bounds:
                     if not rule.holds(item):

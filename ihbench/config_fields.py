@@ -57,8 +57,9 @@ Text = Annotated[str, Readable()]
 def flat(config: Any) -> dict[str, Any]:
     """Name -> value of a dataclass or a table; the fields of a nested one come as "outer.inner"."""
     out: dict[str, Any] = {}
-    for name, value in (config if isinstance(config, Mapping) else _members(config)).items():
-        if isinstance(value, Mapping) or is_config(value):
+    table = isinstance(config, Mapping)
+    for name, value in (config if table else _members(config)).items():
+        if isinstance(value, Mapping) if table else is_config(value):
             out |= {f"{name}.{inner}": leaf for inner, leaf in flat(value).items()}
         else:
             out[name] = value
@@ -131,12 +132,12 @@ def read(hint: Any, value: Any, where: str, key: str = "", strict: bool = True) 
         some = [part for part in get_args(hint) if part is not type(None)]
         hint = some[0] if len(some) == 1 else hint
     plain, extras = (get_args(hint)[0], hint.__metadata__) if get_origin(hint) is Annotated else (hint, ())
-    origin, parts, at = get_origin(plain), get_args(plain), f"{where}: {key}" if key else where
+    origin, parts, at = get_origin(plain), get_args(plain), ": ".join(filter(None, (where, key)))
     if has_text(plain) and isinstance(value, str):
         try:
             return plain.from_text(value)
         except ValueError as error:
-            raise BadInput(f"{at}{':' * bool(key)} {shown(value)}: {error}") from error
+            raise BadInput(f"{at}: {error}, found {shown(value)}") from error
     if isinstance(plain, type) and is_dataclass(plain):
         return _read_fields(plain, value, where, key, strict)
     if origin is Mapping:

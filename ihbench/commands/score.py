@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from ihbench import registry
 from ihbench.commands.options.parse import options
-from ihbench.commands.options.scene_choice import OcclusionChoice, ProtocolChanges
+from ihbench.commands.options.scene_choice import ProtocolChanges
 from ihbench.commands.report import headline
 from ihbench.errors import BadInput
 
@@ -114,8 +114,7 @@ def _source(chosen: ScoreOptions) -> tuple[DataSource, Prepared | None]:
     if (chosen.protocol is None) == (chosen.prepared is None):
         raise BadInput("score: give either --protocol, or with --prepared the folder that `ihbench prepare` wrote")
     if chosen.prepared is not None:
-        changes = (chosen.profile, chosen.image_size, chosen.train_frames, chosen.test_frames)
-        if any(change is not None for change in changes) or chosen.occlusion != OcclusionChoice():
+        if chosen.profile is not None or chosen.changes():
             raise BadInput(
                 f"--prepared {chosen.prepared}: says profile, size, frames and occlusion itself; leave those out"
             )

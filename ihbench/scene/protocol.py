@@ -300,10 +300,10 @@ class ProtocolFile:
 
 
 WORDS = ("title", "reason", "source")  # for readers: no choices
-CHOICES = {  # name -> type of what can be changed; whether an occluder stands in the scene is its rule's to say
+CHOICES = {  # name -> type of what can be changed; test.pose has one value, occlusion.in_scene is its rule's to say
     name: hint
     for name, hint in hints(ProtocolFile).items()
-    if name not in (*WORDS, "id", "version", "occlusion.in_scene")
+    if name not in (*WORDS, "id", "version", "test.pose", "occlusion.in_scene")
 }
 
 
@@ -340,10 +340,14 @@ class Protocol(ProtocolFile):
         its rule, cannot have.
         """
         called = {name: (flags or {}).get(name, f"--protocol.{name.replace('_', '-')}") for name in values}
-        new = {name: _read_choice(name, value, called[name]) for name, value in values.items()}
-        for name in [*new]:
-            if name not in ALWAYS_SHOWN and new[name] == reduce(getattr, name.split("."), self):
-                del new[name]
+        new: dict[str, Any] = {}
+        for name, value in values.items():
+            if name not in CHOICES:
+                raise BadInput(f"{called[name]}: no choice of a protocol: {registry.nearest(name, list(CHOICES))}")
+            present = reduce(getattr, name.split("."), self)
+            value = _as_real(read(CHOICES[name], value, "", called[name]), present)
+            if name in ALWAYS_SHOWN or value != present:
+                new[name] = value
         shown = {name: values[name] if name in SHORT else value for name, value in new.items()}
         if "train.frames" in new or "test.frames" in new:
             new.setdefault("subjects.spans", None)
@@ -487,15 +491,6 @@ def protocol_from(content: Mapping[str, Any], profile: str, version: str) -> Pro
     return replace(_under(file, profile), changed=version.removeprefix(file.version))
 
 
-def _read_choice(name: str, value: Any, flag: str) -> Any:
-    """A choice's value, checked: texts of spans as spans, whole numbers of real choices as real ones."""
-    hint = CHOICES.get(name)
-    if hint is None:
-        raise BadInput(f"{flag}: no choice of a protocol: {registry.nearest(name, list(CHOICES))}")
-    value = read(hint, value, flag)
-    return float(value) if get_args(hint)[:1] == (float,) else value
-
-
 def _under(file: ProtocolFile, profile: str) -> Protocol:
     return Protocol(**{field.name: getattr(file, field.name) for field in fields(file)}, profile=profile)
 
@@ -523,10 +518,19 @@ def _in_version(shown: Mapping[str, Any]) -> str:
     return "".join(parts) + (f"+occlusion={','.join(occlusion)}" if occlusion else "")
 
 
+def _as_real(value: Any, present: Any) -> Any:
+    """Whole numbers as real ones where the protocol has real ones."""
+    if isinstance(present, tuple) and present:
+        return tuple(_as_real(item, present[0]) for item in value)
+    return float(value) if isinstance(present, float) else value
+
+
 def _words(value: Any) -> str:
     """A value in a version: short, and the same for the same value."""
     if isinstance(value, float):
         return f"{value:g}"
+    if isinstance(value, tuple) and all(isinstance(item, str | float) for item in value):
+        value = ",".join(map(_words, value))
     text = value if isinstance(value, str) else json.dumps(as_table(value), separators=(",", ":"))
     return text if len(text) <= LONGEST_CHANGE else hashlib.sha256(text.encode()).hexdigest()[:16]
 

@@ -74,6 +74,8 @@ WRONG = [
     ({"occlusion": {"fraction": 2}}, "occlusion.fraction 2: expected 0 to 1"),
     ({"occlusion": {"covers": float("nan")}}, "occlusion.covers nan: expected 0 to 1"),
     ({"occlusion": {"rule": 5}}, "occlusion.rule 5"),
+    ({"choices": {"image.edg": "soft"}}, "choices 'image.edg': did you mean 'image.edge'"),
+    ({"choices": {"image.background": (0, 0, 2)}}, "choices.image.background 0 0 2: expected 0 to 1"),
     ({"brightnes": 0.5}, "did you mean 'brightness'"),
     ({"brightness": "bright"}, "--method.brightness 'bright': expected a number"),
     ({"brightness": float("nan")}, "--method.brightness nan"),
@@ -142,11 +144,12 @@ def test_numpys_numbers_lists_and_paths_as_text_are_taken(call, bench):
 
 def test_frames_occlusion_and_size_are_those_of_the_command_line(call, bench, mannequin):
     words = ("--train-frames", "0:300:100", "--test-frames", "0:300:150", "--image-size", "48", "--occlusion.rule",
-             "central-band", "--occlusion.fraction", "0.3", "--occlusion.covers", "0.5", "--seed", "1")  # fmt: skip
+             "central-band", "--occlusion.fraction", "0.3", "--occlusion.covers", "0.5", "--seed", "1",
+             "--protocol.image.edge", "soft")  # fmt: skip
     assert bench.run(*words, method=mannequin).status == 0
     same = {
         "train_frames": "0:300:100", "test_frames": "0:300:150", "image_size": 48,
-        "occlusion": {"rule": "central-band", "fraction": 0.3, "covers": 0.5},
+        "occlusion": {"rule": "central-band", "fraction": 0.3, "covers": 0.5}, "choices": {"image.edge": "soft"},
     }  # fmt: skip
     result = call("run", seed=1, **same)
     assert bench.folders() == [result.folder]  # found, not run again

@@ -3,8 +3,10 @@
 import pytest
 
 from ihbench import registry
+from ihbench.commands.options.parse import options
+from ihbench.commands.protocol import Show
 from ihbench.errors import BadInput
-from ihbench.scene.protocol import difference, load_protocol, read_protocol
+from ihbench.scene.protocol import Cameras, Span, TestGroup, difference, load_protocol, protocol_from, read_protocol
 
 RAW = 10_000  # more frames than any subject has: the protocol's own limits rule
 
@@ -70,6 +72,54 @@ def test_the_digest_follows_choices_and_not_words():
     assert quick.digest != paper.digest
     reworded = read_protocol_text(PROTOCOL.replace('title = "', 'title = "other '))
     assert reworded.digest == read_protocol_text(PROTOCOL).digest
+
+
+@pytest.mark.parametrize(
+    ("words", "version"),
+    [
+        ("--image-size 128", "size=128"),
+        ("--protocol.image.size 128", "size=128"),
+        ("--protocol.image.size 512 --protocol.image.edge hard", ""),  # as it is
+        ("--train-frames 0:300:5 --protocol.test.frames 1::2", "train=0:300:5+test=1::2"),
+        ("--protocol.occlusion.fraction 0.3", "occlusion=strip-generic,fraction=0.3"),
+        ("--occlusion.fraction 0.3 --protocol.occlusion.covers.of raw",
+         "occlusion.covers.of=raw+occlusion=strip-generic,fraction=0.3"),
+        ("--protocol.image.background 0 0 0.5 --protocol.image.undistort False",
+         "image.background=0,0,0.5+image.undistort=false"),
+        ("--protocol.subjects.spans 3 0:9:5,9:12:1", 'subjects.spans={"3":{"train":[0,9,5],"test":[9,12,1]}}'),
+    ],
+)  # fmt: skip
+def test_every_choice_is_a_flag_and_stands_behind_the_version(words, version):
+    chosen = options(Show, ["zju_occ", *words.split()], "protocol", "")
+    own = load_protocol("zju_occ", "paper")
+    (changed,) = chosen.apply(own)
+    assert changed.changed == "+" * bool(version) + version
+    assert (changed == own) is (version == "")
+    assert protocol_from(changed.content, "paper", changed.name.partition("@")[2]) == changed
+
+
+def test_further_test_views_are_a_flag():
+    changed = load_protocol("zju_occ").with_fields({"also": ("twice,0:1,0:100:2",)})
+    assert changed.also == (TestGroup("twice", Cameras(0, 1, 1), Span(0, 100, 2)),)
+    assert len(changed.changed) < 30  # a digest stands for it
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("--image-size 64 --protocol.image.size 32", "--image-size says it, too"),
+        ("--protocol.image.size 7", "--protocol.image.size 7: expected 8 to 8192"),
+        ("--protocol.train.frames 5:1", "--protocol.train.frames: expected a stop above the start, found '5:1'"),
+        ("--protocol.subjects.names ../x", "--protocol.subjects.names, entry 1: expected a name"),
+        ("--protocol.image.background 0 0", "input length 2 did not match"),
+        ("--protocol.metrics.regions full", "headline is 'body', expected one of full"),
+    ],
+)
+def test_a_choice_that_no_protocol_has_is_refused_by_its_flag(words, told):
+    with pytest.raises(BadInput) as refused:
+        options(Show, ["zju_occ", *words.split()], "protocol", "").apply(load_protocol("zju_occ"))
+    assert told in str(refused.value)
+    assert "\n" not in str(refused.value)
 
 
 PROTOCOL = (registry.package_folder("protocol", "zju_occ") / "zju_occ.toml").read_text(encoding="utf-8")

@@ -22,11 +22,12 @@ Options = TypeVar("Options")
 
 BORDER = re.compile(r"\x1b\[[0-9;]*m|[│╰╯─]")  # and colours of the box that tyro draws
 RULE = re.compile(r"\W*[─-]{3}[\W]*")
-UNION = re.compile(r"no type matching .* Got errors: .*- <class '[\w.]+'>: (?!\[.*\] does not match)")
+UNION = re.compile(r"no type matching .* Got errors: .*- (?:<class '[\w.]+'>|tuple\[.*\]): (?!\[.*\] does not match)")
 TUPLE = re.compile(
     r"Could not find valid parse for arguments: (\[.*?\]); (Argument helptext: \S+ \[?(INT|FLOAT|STR|PATH))\b"
 )
 KINDS = {"STR": "plain text", "PATH": "possible paths"}  # what else is told of: numbers
+NAMED = {"method": "config", "protocol": "choices"}  # outer part of a flag -> field of the options
 SHELLS = ("bash", "zsh", "tcsh")
 
 
@@ -64,7 +65,7 @@ def _refuse_empty(chosen: Any, argv: list[str]) -> None:
         if word.startswith("--") and following.startswith("--"):
             value = chosen
             for name in word.removeprefix("--").replace("-", "_").split("."):
-                value = getattr(value, "config" if name == "method" and "." in word else name, None)
+                value = getattr(value, NAMED.get(name, name) if "." in word else name, None)
             if value == ():
                 raise BadInput(f"{word}: expected one value or more, or leave it out")
 
