@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import shutil
-import time
 import zipfile
 from functools import partial
 from pathlib import Path
@@ -319,11 +318,6 @@ def test_several_scenes_are_named_by_folder_or_file(tmp_path, own_body):
         PlainScene(tmp_path)
 
 
-def test_a_scene_folder_may_be_the_current_folder(written, monkeypatch):
-    monkeypatch.chdir(written[0])
-    assert PlainScene(".").subjects() == ["dance"]
-
-
 def test_other_folders_are_bad_input(tmp_path, written):
     with pytest.raises(BadInput, match="no such folder"):
         PlainScene(tmp_path / "nowhere")
@@ -335,19 +329,6 @@ def test_other_folders_are_bad_input(tmp_path, written):
         PlainScene(tmp_path / "deep")
     with pytest.raises(BadInput):
         PlainScene.check(tmp_path / "nowhere")
-
-
-def test_opening_reads_no_picture(copy):
-    for path in copy.rglob("*.png"):
-        path.write_bytes(b"")
-    start = time.perf_counter()
-    capture = PlainScene(copy).open("dance")
-    capture.camera(0)
-    capture.body_pose(0)
-    capture.content_digest(0, 0)
-    assert time.perf_counter() - start < 0.5
-    with pytest.raises(BadInput, match=r"000003\.png"):
-        capture.image(0, 0)
 
 
 # ------------------------------------------------------------------------------------------- bad files
@@ -495,44 +476,6 @@ def test_pickles_and_giants_in_a_pose_file_are_bad_input(copy, monkeypatch):
     np.savez_compressed(path, pose=np.zeros((2000, 72)))
     with pytest.raises(BadInput, match=r"an array of 1152128 bytes"):
         read_poses(path)
-
-
-def test_wrong_pictures_are_bad_input(copy):
-    image, mask = copy / "images/left/000003.png", copy / "masks/left/000003.png"
-    image.write_bytes(image.read_bytes()[:60])
-    with pytest.raises(BadInput, match=r"images/left/000003\.png"):
-        PlainScene(copy).open("dance").image(0, 0)
-    image.unlink()
-    mask.unlink()
-    capture = PlainScene(copy).open("dance")
-    for read, where in ((capture.image, "images"), (capture.silhouette, "masks")):
-        with pytest.raises(BadInput, match=rf"{where}/left/000003\.png.*no such file") as error:
-            read(0, 0)
-        message(error)
-    Image.fromarray(np.zeros((HEIGHT, WIDTH + 2, 3), np.uint8)).save(image)
-    with pytest.raises(BadInput, match=r"66×48 px, but cameras\.json says 64×48"):
-        PlainScene(copy).open("dance").image(0, 0)
-    with pytest.raises(BadInput, match="silhouette source 'masks'"):
-        capture.silhouette(0, 1, "masks")
-    for camera, frame in ((2, 0), (-1, 0), (0, 3), (0, -1)):
-        with pytest.raises(BadInput, match=r"no (camera|frame)"):
-            capture.image(camera, frame)
-
-
-def test_digests_follow_the_bytes(copy):
-    before = PlainScene(copy).open("dance").content_digest(0, 0)
-    assert before == PlainScene(copy).open("dance").content_digest(0, 0)
-    seen = {before}
-    for change in (
-        lambda: (copy / "images/left/000003.png").write_bytes(b"other"),
-        lambda: (copy / "masks/left/000003.png").write_bytes(b"other"),
-        lambda: (copy / "masks/left/000003.png").unlink(),
-        lambda: (copy / "images/left/000003.png").unlink(),
-    ):
-        change()
-        seen.add(PlainScene(copy).open("dance").content_digest(0, 0))
-    assert len(seen) == 5
-    assert PlainScene(copy).open("dance").content_digest(0, 0, "none") not in seen
 
 
 # ----------------------------------------------------------------------------------------------- check

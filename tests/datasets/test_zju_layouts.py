@@ -2,7 +2,6 @@
 
 import dataclasses
 import pickle
-import shutil
 
 import numpy as np
 import pytest
@@ -178,16 +177,3 @@ def test_damaged_pickles_are_named(nerf, smpl, damage, words):
         capture = HumanNerfFormat(nerf).open("377", smpl)
         capture.camera(0)
         capture.body_pose(1)
-
-
-def test_missing_and_resized_pictures_are_named(nerf, smpl):
-    shutil.copy(nerf / "images" / "camera_01_frame_000000.png", nerf / "masks" / "camera_01_frame_000000.png")
-    (nerf / "images" / "camera_01_frame_000001.png").unlink()
-    humannerf.write_view(nerf, "camera_01_frame_000002", np.zeros((9, 9, 3), np.uint8), np.zeros((9, 9), bool))
-    capture = HumanNerfFormat(nerf).open("377", smpl)
-    with pytest.raises(BadInput, match="no such file"):
-        capture.image(0, 1)
-    with pytest.raises(BadInput, match=r"9×9 px, but the camera.s images are 64×48"):
-        capture.image(0, 2)
-    with pytest.raises(BadInput, match="no frame 7"):
-        capture.image(0, 7)
