@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,16 +98,6 @@ def texel_at(
         column, row = uv[:, 0] * resolution, (1 - uv[:, 1]) * resolution
     row, column = (np.clip(place.astype(np.int64), 0, resolution - 1) for place in (row, column))
     return row, column
-
-
-def grid_sample_coordinates(uv: Any) -> Any:
-    """[..., 2] uv -> the `grid` of torch's grid_sample that samples a map where `sample_uv` does.
-
-    Works on numpy arrays and torch tensors. Pass `align_corners=False, padding_mode="border"`.
-    """
-    grid = 2 * uv - 1
-    grid[..., 1] = -grid[..., 1]
-    return grid
 
 
 def sample_uv(

@@ -8,7 +8,6 @@ taken over, and so is one of another machine that has not been renewed for `STAL
 from __future__ import annotations
 
 import errno
-import inspect
 import json
 import os
 import secrets
@@ -108,10 +107,8 @@ def _system_lock(file: Path) -> Any:
 
     if filelock.FileLock is filelock.SoftFileLock:
         raise NotImplementedError("no file locks on this system")
-    own = {"timeout": 0, "thread_local": False}
-    if "fallback_to_soft" in inspect.signature(filelock.FileLock.__init__).parameters:
-        own["fallback_to_soft"] = False  # claims below know other machines and take over what was left
-    return filelock.FileLock(str(file), **own)
+    # no fallback: the claims below know other machines and take over what was left
+    return filelock.FileLock(str(file), timeout=0, thread_local=False, fallback_to_soft=False)
 
 
 def _acquired(lock: Any) -> bool:
@@ -120,19 +117,8 @@ def _acquired(lock: Any) -> bool:
     try:
         lock.acquire()
     except filelock.Timeout:
-        _check_locks(lock.lock_file)
         return False
     return True
-
-
-def _check_locks(file: str) -> None:
-    """Raise `OSError` where the file system has no locks: early versions of filelock say that somebody holds."""
-    try:
-        import fcntl
-    except ImportError:
-        return
-    with suppress(BlockingIOError, PermissionError), open(file, "rb") as stream:
-        fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
 
 
 # --- claims ---

@@ -35,7 +35,6 @@ WHITE = (1.0, 1.0, 1.0)
 FIGURES = {"1/20": (0.55, 0.27), "1/10": (0.75, 0.4), "1/3": (1.0, 1.0)}  # share of the frame -> of height, width
 FRAME_REGIONS = ("full", "box", "body", "visible", "hidden", "never_seen")
 
-Pair = tuple[NDArray, NDArray]
 Metric = Callable[..., float]  # of two images
 
 

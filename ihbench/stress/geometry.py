@@ -31,8 +31,6 @@ BITS = "both are defined to the bit"
 EXACT = "the definition gives this and nothing else"
 FLOAT32 = "depth and barycentrics are stored in float32"
 
-EPSILON = float(np.finfo(np.float64).eps)
-
 
 def about_z(angle: float) -> NDArray[np.float64]:
     """[3, 3] by the library's sine and cosine, and 1 - cos without cancellation where it is written out."""

@@ -6,7 +6,7 @@ import torch
 
 from ihbench.body import chart_padding, load_body, position_map, sample_uv, texel_table
 from ihbench.body.pose import BodyPose
-from ihbench.body.uv import grid_sample_coordinates, map_coordinates
+from ihbench.body.uv import map_coordinates
 
 
 def padded(values: np.ndarray, index: np.ndarray) -> np.ndarray:
@@ -107,21 +107,14 @@ def test_sampling_clamps_at_the_edge_and_takes_a_single_texel():
 def test_sampling_equals_torch_grid_sample():
     rng = np.random.default_rng(0)
     values, uv = rng.normal(size=(13, 13, 3)), rng.uniform(0, 1, (500, 2))
-    for coordinates in (torch.from_numpy(grid_sample_coordinates(uv)), grid_sample_coordinates(torch.from_numpy(uv))):
-        sampled = torch.nn.functional.grid_sample(
-            torch.from_numpy(values).permute(2, 0, 1)[None],
-            coordinates[None, None],
-            mode="bilinear",
-            padding_mode="border",
-            align_corners=False,
-        )
-        np.testing.assert_allclose(sample_uv(values, uv), sampled[0, :, 0].T.numpy(), atol=1e-12)
-
-
-def test_grid_sample_coordinates_pass_gradients():
-    uv = torch.tensor([[0.3, 0.7]], dtype=torch.float64, requires_grad=True)
-    grid_sample_coordinates(uv).sum().backward()
-    np.testing.assert_array_equal(uv.grad.numpy(), [[2, -2]])
+    sampled = torch.nn.functional.grid_sample(
+        torch.from_numpy(values).permute(2, 0, 1)[None],
+        torch.from_numpy((2 * uv - 1) * [1, -1])[None, None],
+        mode="bilinear",
+        padding_mode="border",
+        align_corners=False,
+    )
+    np.testing.assert_allclose(sample_uv(values, uv), sampled[0, :, 0].T.numpy(), atol=1e-12)
 
 
 @pytest.mark.parametrize("texels", [0, 1, 2, 5])

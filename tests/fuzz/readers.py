@@ -245,22 +245,7 @@ DAMAGES = [
 
 def damaged(data: bytes, others: list[bytes], draw: random.Random) -> tuple[str, bytes]:
     """(what was done, other contents)."""
-    kind = draw.choice(
-        [
-            "bits",
-            "bits",
-            "many_bits",
-            "cut",
-            "zeros",
-            "noise",
-            "inserted",
-            "twice",
-            "swapped",
-            "token",
-            "token",
-            "token",
-        ]
-    )
+    kind = draw.choice(DAMAGES)
     at = draw.randrange(len(data) + 1)
     length = draw.choice([1, 2, 4, 8, 64, 1024])
     if kind in ("bits", "many_bits"):

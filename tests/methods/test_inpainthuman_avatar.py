@@ -107,7 +107,7 @@ def grid_sampled(avatar, level):
     """[N, C] of one level by torch's grid_sample on a padded map: an independent way to the same features."""
     from scipy.ndimage import distance_transform_edt
 
-    from ihbench.body.uv import grid_sample_coordinates, texel_table
+    from ihbench.body.uv import texel_table
 
     sizes = avatar.config.levels
     size, start = sizes[level], sum(r * r for r in sizes[:level])
@@ -115,7 +115,7 @@ def grid_sampled(avatar, level):
     inside = texel_table(BODY, size).mask
     row, column = np.asarray(distance_transform_edt(~inside, return_distances=False, return_indices=True))
     padded = table[torch.from_numpy(row), torch.from_numpy(column)].permute(2, 0, 1)[None]
-    grid = grid_sample_coordinates(torch.from_numpy(avatar.texels.uv.copy()).float())[None, None]
+    grid = torch.from_numpy((2 * avatar.texels.uv - 1) * [1, -1]).float()[None, None]
     sampled = torch.nn.functional.grid_sample(
         padded, grid, mode="bilinear", padding_mode="border", align_corners=False
     )
