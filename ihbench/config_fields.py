@@ -128,6 +128,8 @@ def read(hint: Any, value: Any, where: str, key: str = "", strict: bool = True) 
     image.size: expected …". `strict` refuses keys that a dataclass does not have; off for files that another version
     may have written.
     """
+    if value is None and fits(value, hint):
+        return None
     if get_origin(hint) in (Union, types.UnionType):
         some = [part for part in get_args(hint) if part is not type(None)]
         hint = some[0] if len(some) == 1 else hint
@@ -170,7 +172,7 @@ def _read_fields(kind: type[Kind], value: Any, where: str, key: str, strict: boo
         if strict and name not in known:
             raise BadInput(f"{where}: unknown key {inside + name!r}: {nearest(name, list(known))}")
     for name, field in known.items():
-        if name not in table and field.default is MISSING:
+        if name not in table and field.default is field.default_factory is MISSING:
             raise BadInput(f"{where}: key {inside + name!r} is missing")
     own = _hints(kind)
     given = {name: read(own[name], table[name], where, inside + name, strict) for name in known if name in table}

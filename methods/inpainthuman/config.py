@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from ihbench.bounds import STEPS, MultipleOf, Within, check
 from ihbench.diffusion.inpaint_config import PAPER_INPAINT, QUICK_INPAINT, InpaintConfig
@@ -196,16 +196,6 @@ def _one_fit_does(config: InpaintHumanConfig) -> bool:
 def _both_fits(share: float) -> dict[str, float]:
     """A share of the seconds of both stages that optimise the avatar."""
     return {"fit/stage1": share, "fit/stage3": share}
-
-
-def config_from(words: dict[str, Any]) -> InpaintHumanConfig:
-    """What `dataclasses.asdict` made, back from JSON. Raises `TypeError` for fields that do not exist."""
-    values: dict[str, Any] = {k: tuple(value) if isinstance(value, list) else value for k, value in words.items()}
-    if "inpaint" in values:
-        values["inpaint"] = InpaintConfig(**values["inpaint"])
-    if "refine" in values:
-        values["refine"] = RefineConfig(**values["refine"])
-    return InpaintHumanConfig(**values)
 
 
 def outside_files(config: InpaintHumanConfig) -> list[Path]:

@@ -12,7 +12,7 @@ from ihbench.clock.threads import one_torch_thread
 from ihbench.diffusion.crops.part_map import smpl_parts
 from ihbench.diffusion.inpaint_config import Filler
 from ihbench.methods.inpainthuman.inpainting.colour_fills import GREY, MeanColour, NavierStokes, Telea
-from ihbench.methods.inpainthuman.inpainting.fillers import fillers
+from ihbench.methods.inpainthuman.inpainting.simple_inpainters import simple_inpainters
 from ihbench.methods.inpainthuman.inpainting.surface_colours import counted_colours, off_the_rim, pixel_texels
 from ihbench.methods.inpainthuman.inpainting.texture_fills import (
     MirroredTexture,
@@ -39,7 +39,7 @@ from .hidden_person import (
 
 BODY = the_body()
 BLUE = (0.2, 0.4, 1.0)
-NAMES = list(fillers(BODY, WHITE))
+NAMES = list(simple_inpainters(BODY, WHITE))
 TEXELS = 128
 RED, GREEN = (0.8, 0.2, 0.1), (0.1, 0.7, 0.3)
 
@@ -68,7 +68,7 @@ def views():
 
 
 def test_the_table_has_every_name_of_the_switch():
-    table = fillers(BODY, WHITE)
+    table = simple_inpainters(BODY, WHITE)
     assert ["diffusion", *table] == list(get_args(Filler))
     assert all(filler.name == name for name, filler in table.items())
 
@@ -77,7 +77,7 @@ def test_the_table_has_every_name_of_the_switch():
 def test_known_pixels_stay_and_unknown_ones_change(name, views):
     shown = [replace(v, image=np.where(v.unknown[..., None], np.uint8(3), v.image)) for v in views]
     before = [view.image.copy() for view in shown]
-    filler = fillers(BODY, BLUE)[name]
+    filler = simple_inpainters(BODY, BLUE)[name]
     out = fill(filler, shown)
     assert len(out) == 3
     for view, old, new in zip(shown, before, out, strict=True):
@@ -94,7 +94,7 @@ def test_known_pixels_stay_and_unknown_ones_change(name, views):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_nothing_unknown_and_no_views(name, views):
-    filler = fillers(BODY, WHITE)[name]
+    filler = simple_inpainters(BODY, WHITE)[name]
     assert fill(filler, []) == []
     view = nothing_unknown(views[0])
     assert np.array_equal(fill(filler, [view])[0], view.image)
@@ -103,7 +103,7 @@ def test_nothing_unknown_and_no_views(name, views):
 @pytest.mark.parametrize("name", NAMES)
 def test_a_view_without_a_known_pixel(name, views):
     """Alone it is grey (on the body, where a fill knows the body); beside others the person's colours help."""
-    view, filler = all_unknown(views[0]), fillers(BODY, BLUE)[name]
+    view, filler = all_unknown(views[0]), simple_inpainters(BODY, BLUE)[name]
     (alone,) = fill(filler, [view])
     on = np.ones_like(view.body) if name in ("telea", "navier-stokes") else view.body
     assert (alone[on] == GREY).all()

@@ -190,7 +190,7 @@ class TestStage2:
         first = Stage2(avatar, training, SIMPLE, 0, Ledger(tmp_path)).run(QUIET)
         assert len(first) == 3
         assert (tmp_path / "inpainting.png").is_file()
-        monkeypatch.setattr(Stage2, "_painter", None)
+        monkeypatch.setattr(Stage2, "_inpainter", None)
         again = Stage2(avatar, training, SIMPLE, 0, Ledger(tmp_path)).run(QUIET)
         for a, b in zip(first, again, strict=True):
             assert a.index == b.index
@@ -201,7 +201,7 @@ class TestStage2:
             np.testing.assert_array_equal(a.view.body_pose.pose, b.view.body_pose.pose)
 
     def test_nothing_hidden_loads_no_painter(self, monkeypatch):
-        monkeypatch.setattr(Stage2, "_painter", None)
+        monkeypatch.setattr(Stage2, "_inpainter", None)
         ledger = Ledger()
         assert Stage2(an_avatar(), one_sided(hidden=None), SIMPLE, 0, ledger).run(QUIET) == []
         assert [event.data["what"] for event in ledger.events] == ["inpainting"]

@@ -17,11 +17,12 @@ from ihbench.body.canonical import canonical_pose
 from ihbench.body.pose import BodyPose
 from ihbench.body.uv import chart_padding, texel_table
 from ihbench.camera import Camera
+from ihbench.config_fields import read
 from ihbench.errors import BadInput
 from ihbench.methods.inpainthuman.avatar.decoder import GaussianDecoder, positional_encoding, scale_factor
 from ihbench.methods.inpainthuman.avatar.pose_residual import ResidualEncoder, root_free_position_map
 from ihbench.methods.inpainthuman.avatar.uv_features import UVFeatures, bilinear_corners
-from ihbench.methods.inpainthuman.config import InpaintHumanConfig, config_from
+from ihbench.methods.inpainthuman.config import InpaintHumanConfig
 from ihbench.render.splat import render_gaussians
 from ihbench.render.triangles import triangle_areas, triangle_crosses
 from ihbench.render.zbuffer import rasterize
@@ -239,10 +240,11 @@ class GaussianAvatar(nn.Module):
         if fitted != given:
             raise BadInput(f"{folder}: was fitted on another body ({fitted}) than the one given ({given})")
         try:
-            avatar = cls(config_from(words["config"]), body, np.array(words["betas"]), seed=0)
+            config = read(InpaintHumanConfig, words["config"], "avatar.json: config")
+            avatar = cls(config, body, np.array(words["betas"]), seed=0)
             avatar.load_state_dict(tensors)
             avatar.residual_on = bool(words["residual_on"])
-        except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        except (BadInput, AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
             raise BadInput(
                 f"{folder}: avatar.json and avatar.safetensors do not belong together or to this version "
                 f"({type(error).__name__}: {str(error).splitlines()[0]}); fit again"

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ihbench.clock.checkpoints import Tensors, Words
 from ihbench.clock.events import Resumed, RolledBack
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
@@ -245,7 +246,7 @@ class Optimisation(ABC):
         return tensors
 
     @torch.no_grad()
-    def _put(self, tensors: Mapping[str, Any]) -> None:
+    def _put(self, tensors: Tensors) -> None:
         """Set parameters and moments to copies of these."""
         self.optimizer.state.clear()
         for name, p in self.avatar.named_parameters():
@@ -261,7 +262,7 @@ class Optimisation(ABC):
     def save(self) -> None:
         """Hand parameters, optimiser moments, the state to go back to and the step to the ledger."""
         tensors, first = self._tensors(), self._first_bad
-        meta: dict[str, Any] = {"step": self.step, "rolled_back": self.rolled_back, "usual": self._usual}
+        meta: Words = {"step": self.step, "rolled_back": self.rolled_back, "usual": self._usual}
         meta["first_bad"] = None if first is None else [first.step, first.reason]
         if self._good is not None and self.step < self.steps:
             meta["good"] = self._good.step

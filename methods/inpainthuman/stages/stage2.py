@@ -1,13 +1,14 @@
-"""Stage 2, inpainting (sec. 3.3): personalise a painter, paint what no view shows, find whole silhouettes."""
+"""Stage 2, inpainting (sec. 3.3): personalise an inpainter, paint what no view shows, find whole silhouettes."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Any
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ihbench.clock.checkpoints import Tensors
 from ihbench.clock.events import Inpainted, LeftOut, LossCurve, Resumed
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
@@ -19,9 +20,13 @@ from ihbench.methods.inpainthuman.inpainting.shown_view import turntable_view, w
 from ihbench.methods.inpainthuman.inpainting.surface_need import SeenSurface, key_views, seen_surface
 from ihbench.scene.contracts import MaskState, TrainingSet, TrainView
 
+if TYPE_CHECKING:
+    from ihbench.diffusion.complete_silhouette import SilhouetteFinder
+    from ihbench.diffusion.diffusion_inpainter import DiffusionInpainter
+
 STATE = "stage2-painted"
-SIMPLE_SIZE = 128  # px, height of the crops of painters without a size of their own
-LEAST_PIXELS = 12  # of a view; fewer are not worth a painter
+SIMPLE_SIZE = 128  # px, height of the crops of inpainters without a size of their own
+LEAST_PIXELS = 12  # of a view; fewer are not worth an inpainter
 
 
 class Stage2:
@@ -42,7 +47,7 @@ class Stage2:
             shown = self._shown(surface)
         if not shown and not self.config.always:
             return self._nothing("no training view hides surface that needs a painter")
-        painter, size, square = self._painter()
+        inpainter, size, square = self._inpainter()
         finder = self._silhouettes()  # before anything is learned: its weights may be missing
         body, views = self.training.body, self.training.views
         with self.ledger.stage("look"):
@@ -52,14 +57,15 @@ class Stage2:
                 return self._nothing("what is hidden lies outside of every crop of the body")
             frames = [cut_view(views[k], k, body, size, square) for k in range(len(views))]
             filmed = with_frames(crops, frames)
-        if self.config.filler == "diffusion":
-            painter.learn(frames, progress)
+        diffusion = cast("DiffusionInpainter", inpainter) if self.config.filler == "diffusion" else None
+        if diffusion is not None:
+            diffusion.learn(frames, progress)
         if not crops:
             return self._nothing("nothing needed painting; personalised as asked")
         with self.ledger.stage("inpaint"):
-            # the simple painters take their colours from whatever frame shows them
-            given = crops if self.config.filler == "diffusion" else filmed
-            painted = painter.inpaint(given, progress)[: len(crops)]
+            # the simple inpainters take their colours from whatever frame shows them
+            given = crops if diffusion is not None else filmed
+            painted = inpainter.inpaint(given, progress)[: len(crops)]
             if self.config.context == "seen" and self.config.trust < 1:
                 painted = [self._with_own_guess(*each) for each in zip(crops, painted, strict=True)]
         with self.ledger.stage("silhouette"):
@@ -68,8 +74,8 @@ class Stage2:
             paste_back(shown[view.index], view, image, silhouette, self._original(view.index))
             for view, image, silhouette in zip(crops, painted, silhouettes, strict=True)
         ]
-        if self.config.filler == "diffusion":
-            for state, curve in painter.curves.items():
+        if diffusion is not None:
+            for state, curve in diffusion.curves.items():
                 self.ledger.event(LossCurve(state, curve.steps[::5], curve.losses[::5]))
         with self.ledger.stage("measure"):
             self._record(crops, filmed, painted, silhouettes)
@@ -82,7 +88,7 @@ class Stage2:
         return []
 
     def _shown(self, surface: SeenSurface) -> dict[int, TrainView]:
-        """Number -> view, as the painter is shown it; numbers beyond the training views are of turntable views."""
+        """Number -> view, as the inpainter is shown it; numbers beyond the training views are of turntable views."""
         training, config = self.training, self.config
         views = training.views
         if config.context == "frame":
@@ -98,13 +104,13 @@ class Stage2:
             shown[len(views) + turn] = turntable_view(angle, like, training, self.avatar, surface)
         return {k: view for k, view in shown.items() if (view.mask == MaskState.UNKNOWN).sum() >= LEAST_PIXELS}
 
-    def _painter(self) -> tuple[Any, int, bool]:
-        """The painter, the height of its crops in px, and whether they must be square."""
+    def _inpainter(self) -> tuple[Inpainter, int, bool]:
+        """The inpainter, the height of its crops in px, and whether they must be square."""
         config = self.config
         if config.filler != "diffusion":
-            from ihbench.methods.inpainthuman.inpainting.fillers import fillers
+            from ihbench.methods.inpainthuman.inpainting.simple_inpainters import simple_inpainters
 
-            simple: Inpainter = fillers(self.training.body, self.training.background)[config.filler]
+            simple: Inpainter = simple_inpainters(self.training.body, self.training.background)[config.filler]
             return simple, SIMPLE_SIZE, False
         from ihbench.diffusion.diffusion_inpainter import DiffusionInpainter, load_backbone
 
@@ -112,7 +118,7 @@ class Stage2:
             backbone = load_backbone(config, str(self.avatar.device))
         return DiffusionInpainter(backbone, config, self.seed, self.ledger), backbone.size, backbone.square
 
-    def _silhouettes(self) -> Any:
+    def _silhouettes(self) -> SilhouetteFinder:
         from ihbench.diffusion.complete_silhouette import silhouette_finder
 
         device = str(self.avatar.device)
@@ -158,7 +164,7 @@ class Stage2:
     # --- resume ---
 
     def _save(self, painted: list[PaintedView]) -> None:
-        tensors: dict[str, Any] = {"none": np.zeros(1, np.uint8)}
+        tensors: Tensors = {"none": np.zeros(1, np.uint8)}
         for n, view in enumerate(painted):
             tensors |= {f"{n}.image": view.view.image, f"{n}.mask": view.view.mask}
             tensors |= {f"{n}.generated": view.generated.astype(np.uint8)}

@@ -94,18 +94,18 @@ def _paint(
     device: str,
 ) -> list[NDArray[np.uint8]]:
     if row in FILLS:
-        from ihbench.methods.inpainthuman.inpainting.fillers import fillers
+        from ihbench.methods.inpainthuman.inpainting.simple_inpainters import simple_inpainters
 
-        painted = fillers(body, background)[row].inpaint(views, progress)
+        painted = simple_inpainters(body, background)[row].inpaint(views, progress)
         return [painted[k] for k in chosen]
     from ihbench.diffusion.diffusion_inpainter import DiffusionInpainter, load_backbone
 
     ti, lora, sg = DIFFUSION[row]
     switched = replace(config, ti=ti, lora=lora, sg=sg)
-    painter = DiffusionInpainter(load_backbone(switched, device), switched, seed, ledger)
+    inpainter = DiffusionInpainter(load_backbone(switched, device), switched, seed, ledger)
     if ti or lora:  # a generic model learns nothing of the person, its ControlNet neither
-        painter.learn(views, progress)
-    return painter.inpaint([views[k] for k in chosen], progress)
+        inpainter.learn(views, progress)
+    return inpainter.inpaint([views[k] for k in chosen], progress)
 
 
 def _row(images: Sequence[NDArray[np.uint8]], most: int = 10) -> NDArray[np.uint8]:

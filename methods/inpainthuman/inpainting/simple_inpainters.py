@@ -1,4 +1,4 @@
-"""The simple fills by name, which the diffusion model is measured against."""
+"""The simple inpainters by name, which the diffusion model is measured against."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from ihbench.methods.inpainthuman.inpainting.colour_fills import MeanColour, Nav
 from ihbench.methods.inpainthuman.inpainting.texture_fills import MirroredTexture, TemporalCopy
 
 
-def fillers(body: Body, background: tuple[float, float, float]) -> dict[str, Inpainter]:
+def simple_inpainters(body: Body, background: tuple[float, float, float]) -> dict[str, Inpainter]:
     """Name -> inpainter, in the order of tables. `background` is RGB in [0, 1]."""
     known: tuple[Inpainter, ...] = (
         MeanColour(background),
@@ -18,4 +18,4 @@ def fillers(body: Body, background: tuple[float, float, float]) -> dict[str, Inp
         MirroredTexture(body, background),
         TemporalCopy(body, background),
     )
-    return {filler.name: filler for filler in known}
+    return {inpainter.name: inpainter for inpainter in known}
