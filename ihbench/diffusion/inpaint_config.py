@@ -9,7 +9,9 @@ from ihbench.bounds import STEPS, Within, check
 from ihbench.errors import BadInput
 
 TOKEN = "<someone>"
-Filler = Literal["diffusion", "mean", "telea", "navier-stokes", "push-pull", "mirror", "temporal"]
+Filler = Literal[
+    "diffusion", "mean", "telea", "navier-stokes", "shift-map", "fsr", "biharmonic", "push-pull", "mirror", "temporal"
+]  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import get_args
 
+import cv2
 import numpy as np
 import pytest
 
@@ -11,7 +12,8 @@ from ihbench.clock.progress import Progress
 from ihbench.clock.threads import one_torch_thread
 from ihbench.diffusion.crops.part_map import smpl_parts
 from ihbench.diffusion.inpaint_config import Filler
-from ihbench.methods.inpainthuman.inpainting.colour_fills import GREY, MeanColour, NavierStokes, Telea
+from ihbench.errors import BadInput
+from ihbench.methods.inpainthuman.inpainting.colour_fills import GREY, IMAGE_FILLS, MeanColour
 from ihbench.methods.inpainthuman.inpainting.simple_inpainters import simple_inpainters
 from ihbench.methods.inpainthuman.inpainting.surface_colours import counted_colours, off_the_rim, pixel_texels
 from ihbench.methods.inpainthuman.inpainting.texture_fills import (
@@ -105,11 +107,11 @@ def test_a_view_without_a_known_pixel(name, views):
     """Alone it is grey (on the body, where a fill knows the body); beside others the person's colours help."""
     view, filler = all_unknown(views[0]), simple_inpainters(BODY, BLUE)[name]
     (alone,) = fill(filler, [view])
-    on = np.ones_like(view.body) if name in ("telea", "navier-stokes") else view.body
+    on = np.ones_like(view.body) if filler in IMAGE_FILLS else view.body
     assert (alone[on] == GREY).all()
     assert (alone[~on] == eight_bit(BLUE)).all()
     beside = fill(filler, [view, views[1]])[0]
-    assert (beside[view.body] != GREY).any() == (name not in ("telea", "navier-stokes"))
+    assert (beside[view.body] != GREY).any() == (filler not in IMAGE_FILLS)
 
 
 # -------------------------------------------------------------------------------------------- colour
@@ -133,17 +135,24 @@ def test_mean_colour_of_a_view_that_shows_nobody_is_that_of_all(views):
     assert (np.abs(image[views[0].body] - pixels.mean(0)) <= 0.5 + 1e-9).all()
 
 
-@pytest.mark.parametrize(("filler", "off_by"), [(Telea(), 10), (NavierStokes(), 1)], ids=lambda f: str(f))
-def test_opencv_continues_a_plain_crop(filler, off_by, views):
-    """To the image's edges too; Telea's extrapolation overshoots by a few levels."""
+@pytest.mark.parametrize("filler", IMAGE_FILLS, ids=lambda f: f.name)
+def test_a_plain_crop_is_continued(filler, views):
+    """To the image's edges too; the extrapolation of Telea's and FSR overshoots by a few levels."""
+    off_by = 10 if filler.name in ("telea", "fsr") else 1
     view = replace(views[0], image=np.where(views[0].unknown[..., None], np.uint8(0), np.uint8([200, 120, 40])))
     out = fill(filler, [view])[0]
     assert np.abs(out.astype(int) - [200, 120, 40]).max() <= off_by
 
 
-@pytest.mark.parametrize("filler", [Telea(), NavierStokes()], ids=lambda f: f.name)
-def test_opencv_knows_nothing_but_the_crop(filler, views):
+@pytest.mark.parametrize("filler", IMAGE_FILLS, ids=lambda f: f.name)
+def test_nothing_but_the_crop_is_known(filler, views):
     assert np.array_equal(fill(filler, views)[0], fill(filler, views[:1])[0])
+
+
+def test_an_opencv_without_contributed_modules_is_named(views, monkeypatch):
+    monkeypatch.delattr(cv2, "xphoto")
+    with pytest.raises(BadInput, match="opencv-contrib"):
+        fill(simple_inpainters(BODY, WHITE)["fsr"], views)
 
 
 # -------------------------------------------------------------------------------------------- surface

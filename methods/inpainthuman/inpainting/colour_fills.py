@@ -1,8 +1,11 @@
-"""Inpainting that knows nothing of people: one colour, the nearest ones, OpenCV's classics. Every figure's floor."""
+"""Inpainting that knows nothing of people: one colour, the nearest ones, the classics of OpenCV and
+scikit-image. Every figure's floor."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -10,7 +13,9 @@ from numpy.typing import NDArray
 
 from ihbench.clock.progress import Progress
 from ihbench.diffusion.crops.crop_view import CropView
+from ihbench.errors import BadInput
 
+Image = NDArray[np.uint8]  # [S, W, 3] RGB
 RADIUS = 3.0  # px, the neighbourhood that OpenCV's methods look at
 GREY = 128  # where nothing at all is known
 
@@ -35,23 +40,60 @@ class MeanColour:
 
 
 @dataclass(frozen=True)
-class Telea:
-    """A. Telea, "An Image Inpainting Technique Based on the Fast Marching Method", 2004, over the whole crop."""
+class ImageFill:
+    """A classic of whole images, over the whole crop."""
 
-    name = "telea"
+    name: str
+    paint: Callable[[Image, NDArray[np.bool_]], Image]  # image [S, W, 3], unknown [S, W] -> painted [S, W, 3]
 
-    def inpaint(self, views: list[CropView], progress: Progress) -> list[NDArray[np.uint8]]:
-        return _opencv(views, cv2.INPAINT_TELEA, progress)
+    def inpaint(self, views: list[CropView], progress: Progress) -> list[Image]:
+        out = []
+        with progress.task(f"filling by {self.name}", len(views)) as task:
+            for view in views:
+                image = view.image
+                if view.unknown.any():
+                    # with no known pixel the image stays as it is: grey
+                    blank = np.where(view.unknown[..., None], np.uint8(GREY), image)
+                    image = view.completed(blank if view.unknown.all() else self.paint(blank, view.unknown))
+                out.append(image)
+                task.advance()
+        return out
 
 
-@dataclass(frozen=True)
-class NavierStokes:
-    """Bertalmio et al., "Navier-Stokes, Fluid Dynamics, and Image and Video Inpainting", 2001, over the crop."""
+def _opencv(method: int, image: Image, unknown: NDArray[np.bool_]) -> Image:
+    return np.asarray(cv2.inpaint(image, unknown.astype(np.uint8), RADIUS, method), np.uint8)
 
-    name = "navier-stokes"
 
-    def inpaint(self, views: list[CropView], progress: Progress) -> list[NDArray[np.uint8]]:
-        return _opencv(views, cv2.INPAINT_NS, progress)
+def _xphoto(method: str, image: Image, unknown: NDArray[np.bool_]) -> Image:
+    """Raises `BadInput` where OpenCV comes without its contributed modules."""
+    module = getattr(cv2, "xphoto", None)
+    if module is None:
+        raise BadInput("filler: this OpenCV has no cv2.xphoto; pip install opencv-contrib-python-headless")
+    lab = method == "INPAINT_SHIFTMAP"  # compares patches in CIE Lab
+    given = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2Lab), np.uint8) if lab else image
+    out = np.zeros_like(given)
+    module.inpaint(given, np.where(unknown, np.uint8(0), np.uint8(255)), out, getattr(module, method))
+    return np.asarray(cv2.cvtColor(out, cv2.COLOR_Lab2RGB) if lab else out, np.uint8)
+
+
+def _biharmonic(image: Image, unknown: NDArray[np.bool_]) -> Image:
+    from skimage.restoration import inpaint_biharmonic
+
+    return np.round(255 * inpaint_biharmonic(image, unknown, channel_axis=-1)).astype(np.uint8)
+
+
+IMAGE_FILLS = (
+    # A. Telea, "An Image Inpainting Technique Based on the Fast Marching Method", 2004
+    ImageFill("telea", partial(_opencv, cv2.INPAINT_TELEA)),
+    # Bertalmio et al., "Navier-Stokes, Fluid Dynamics, and Image and Video Inpainting", 2001
+    ImageFill("navier-stokes", partial(_opencv, cv2.INPAINT_NS)),
+    # He and Sun, "Statistics of Patch Offsets for Image Completion", 2012
+    ImageFill("shift-map", partial(_xphoto, "INPAINT_SHIFTMAP")),
+    # Genser et al., "Spectral Constrained Frequency Selective Extrapolation for Rapid Image Error Concealment", 2018
+    ImageFill("fsr", partial(_xphoto, "INPAINT_FSR_FAST")),
+    # Damelin and Hoang, "On Surface Completion and Image Inpainting by Biharmonic Functions", 2018
+    ImageFill("biharmonic", _biharmonic),
+)
 
 
 @dataclass(frozen=True)
@@ -96,19 +138,4 @@ def on_background(
     out = np.empty((*body.shape, 3), np.uint8)
     out[:] = np.round(255 * np.asarray(background))
     out[body] = np.round(colour)
-    return out
-
-
-def _opencv(views: list[CropView], method: int, progress: Progress) -> list[NDArray[np.uint8]]:
-    out = []
-    with progress.task("filling with OpenCV", len(views)) as task:
-        for view in views:
-            image = view.image
-            if view.unknown.any():
-                # OpenCV returns an image as it is when no pixel is known: then it is grey
-                blank = np.where(view.unknown[..., None], np.uint8(GREY), image)
-                painted = cv2.inpaint(blank, view.unknown.astype(np.uint8), RADIUS, method)
-                image = view.completed(np.asarray(painted, np.uint8))
-            out.append(image)
-            task.advance()
     return out

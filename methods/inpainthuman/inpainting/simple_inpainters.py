@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ihbench.body import Body
 from ihbench.diffusion.crops.crop_view import Inpainter
-from ihbench.methods.inpainthuman.inpainting.colour_fills import MeanColour, NavierStokes, PushPull, Telea
+from ihbench.methods.inpainthuman.inpainting.colour_fills import IMAGE_FILLS, MeanColour, PushPull
 from ihbench.methods.inpainthuman.inpainting.texture_fills import MirroredTexture, TemporalCopy
 
 
@@ -12,8 +12,7 @@ def simple_inpainters(body: Body, background: tuple[float, float, float]) -> dic
     """Name -> inpainter, in the order of tables. `background` is RGB in [0, 1]."""
     known: tuple[Inpainter, ...] = (
         MeanColour(background),
-        Telea(),
-        NavierStokes(),
+        *IMAGE_FILLS,
         PushPull(background),
         MirroredTexture(body, background),
         TemporalCopy(body, background),
