@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from ihbench.bounds import STEPS, Within, check
 from ihbench.errors import BadInput
@@ -12,6 +12,16 @@ TOKEN = "<someone>"
 Filler = Literal[
     "diffusion", "mean", "telea", "navier-stokes", "shift-map", "fsr", "biharmonic", "push-pull", "mirror", "temporal"
 ]  # fmt: skip
+SIMPLE = get_args(Filler)[1:]
+# rows of `ihbench paint` -> which of ti, lora and sg are on
+COMPONENTS: dict[str, tuple[bool, bool, bool]] = {
+    "generic": (False, False, False),
+    "generic+sg": (False, False, True),
+    "ti": (True, False, False),
+    "ti+lora": (True, True, False),
+    "ti+lora+sg": (True, True, True),
+}
+FULL = "ti+lora+sg"
 
 
 @dataclass(frozen=True)

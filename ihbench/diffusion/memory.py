@@ -23,6 +23,16 @@ def out_of_memory(error: BaseException) -> bool:
     )
 
 
+def halved(batch: int, error: BaseException, line: str) -> int:
+    """Half of a batch that ended in this error. Raises the error itself where it is no lack of memory, and `BadInput`
+    with `line` where a batch of one does not fit."""
+    if not out_of_memory(error):
+        raise error
+    if batch == 1:
+        raise BadInput(line) from error
+    return batch // 2
+
+
 @contextmanager
 def said_when_full(line: str) -> Iterator[None]:
     """Raises `BadInput` with `line` when what happens inside runs out of memory."""

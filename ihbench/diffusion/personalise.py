@@ -23,7 +23,7 @@ from ihbench.diffusion.crops.diffusion_batch import batch_of, by_width
 from ihbench.diffusion.crops.push_pull import push_pull
 from ihbench.diffusion.crops.random_mask import SHARES, random_mask
 from ihbench.diffusion.inpaint_config import InpaintConfig
-from ihbench.diffusion.memory import ADVICE, out_of_memory
+from ihbench.diffusion.memory import ADVICE, halved
 from ihbench.diffusion.subject_token import ANYBODY, SubjectToken
 from ihbench.errors import BadInput
 
@@ -177,14 +177,9 @@ class Personaliser:
                             good = (step, _copies(named))  # a finite loss vouches for them
                         torch.nn.utils.clip_grad_norm_(list(named.values()), 1.0)
                         optimizer.step()
-                except (torch.OutOfMemoryError, MemoryError, RuntimeError) as error:
-                    if not out_of_memory(error):
-                        raise
-                    if batch == 1:
-                        raise BadInput(
-                            f"{what}: one crop does not fit into memory; {ADVICE[self.backbone.name]}"
-                        ) from error
-                    batch = batch // 2
+                except (MemoryError, RuntimeError) as error:
+                    line = f"{what}: one crop does not fit into memory; {ADVICE[self.backbone.name]}"
+                    batch = halved(batch, error, line)
                     self.ledger.event(Warned(f"{what}: out of memory at step {step}, batch now {batch}"))
                     continue
                 if not fine:

@@ -13,8 +13,8 @@ from ihbench.clock.progress import Progress
 from ihbench.diffusion.backbone import Backbone
 from ihbench.diffusion.crops.crop_view import CropView
 from ihbench.diffusion.crops.diffusion_batch import DiffusionBatch, batch_of, by_width, shared_noise
-from ihbench.diffusion.memory import ADVICE, out_of_memory
-from ihbench.errors import BadInput, Diverged
+from ihbench.diffusion.memory import ADVICE, halved
+from ihbench.errors import Diverged
 
 STATE = "stage2-sampled"
 
@@ -101,15 +101,10 @@ def inpaint_views(
                         backbone, batch_of([views[k] for k in now], backbone.device), noise, prompt,
                         steps=steps, use_parts=use_parts, guidance=guidance,
                     )  # fmt: skip
-                except (torch.OutOfMemoryError, MemoryError, RuntimeError) as error:
-                    if not out_of_memory(error):
-                        raise
-                    if batch == 1:
-                        raise BadInput(
-                            f"inpainting: one crop of {width}×{backbone.size} px does not fit into memory; "
-                            f"{ADVICE[backbone.name]}"
-                        ) from error
-                    batch, rest = max(batch // 2, 1), now + rest
+                except (MemoryError, RuntimeError) as error:
+                    size = f"{width}×{backbone.size} px"
+                    line = f"inpainting: one crop of {size} does not fit into memory; {ADVICE[backbone.name]}"
+                    batch, rest = halved(batch, error, line), now + rest
                     continue
                 if not torch.isfinite(painted).all():
                     raise Diverged(0, "the inpainted image is not finite")

@@ -7,14 +7,21 @@ kept in the cache): 374 views of 512², read from 1024² JPEG and PNG files. LPI
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ihbench.kernels.measuring import Row, peak_mib, summary
 from ihbench.kernels.metrics import headline_with
+
+if TYPE_CHECKING:
+    from ihbench.scoring.scoring import LoadedView, Scorer
 
 PROTOCOL, PROFILE = "zju_occ", "paper"
 VIEWS = 374
@@ -27,7 +34,7 @@ def score_rows(repeats: int, views: int = VIEWS, profile: str = PROFILE) -> list
     The predictions are the truth a pixel off. `repeats` above 3 are 3.
     """
     from ihbench.clock.progress import Progress
-    from ihbench.files.images import read_image, write_png
+    from ihbench.files.images import write_png
     from ihbench.metrics.eight_bit import rounded
     from ihbench.scene.data_source import locate
     from ihbench.scene.protocol import load_protocol
@@ -38,7 +45,6 @@ def score_rows(repeats: int, views: int = VIEWS, profile: str = PROFILE) -> list
     source = locate(protocol, None, (protocol.subjects.standin[0],))
     capture, _ = source.open(source.scenes[0], None, Progress())
     scene = open_scene(capture, protocol)
-    background = protocol.image.background
     indices = range(min(views, len(scene.test_keys)))
     rows = []
     with TemporaryDirectory() as name:
@@ -50,25 +56,14 @@ def score_rows(repeats: int, views: int = VIEWS, profile: str = PROFILE) -> list
             write_png(folder / "in" / f"{index}.png", rounded(off))
         for case, metrics in CASES.items():
             samples, memory = [], None
-
-            def score_all(scorer: Scorer) -> None:
-                def predict(loaded):
-                    return read_image(folder / "in" / f"{loaded.index}.png", background)
-
-                def write(loaded, images):
-                    write_png(folder / "out" / f"{loaded.index}.png", images["p"])
-
-                for _ in scorer.scored({"p": predict}, indices, after_each=write, threaded=True):
-                    pass
-
             for k in range(min(repeats, 3)):
                 fresh = open_scene(capture, protocol)  # holds no view of the last pass
                 scorer = replace(built, scene=fresh, presets=(headline_with(metrics),))
                 start = time.perf_counter()
                 if k == 0:
-                    memory = peak_mib(lambda s=scorer: score_all(s))
+                    memory = peak_mib(partial(_score_all, scorer, folder, indices))
                 else:
-                    score_all(scorer)
+                    _score_all(scorer, folder, indices)
                 samples.append(((time.perf_counter() - start) * 1e3, None))
             rows.append(
                 {
@@ -82,3 +77,19 @@ def score_rows(repeats: int, views: int = VIEWS, profile: str = PROFILE) -> list
                 }
             )
     return rows
+
+
+def _score_all(scorer: Scorer, folder: Path, indices: Sequence[int]) -> None:
+    """Read, score and write the images of some test views, as `ihbench score` does."""
+    from ihbench.files.images import read_image, write_png
+
+    def predict(loaded: LoadedView) -> NDArray:
+        return read_image(folder / "in" / f"{loaded.index}.png", scorer.scene.protocol.image.background)
+
+    def write(loaded: LoadedView, images: dict[str, NDArray | None]) -> None:
+        image = images["score"]
+        assert image is not None
+        write_png(folder / "out" / f"{loaded.index}.png", image)
+
+    for _ in scorer.scored({"score": predict}, indices, after_each=write, threaded=True):
+        pass

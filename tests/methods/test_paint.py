@@ -6,8 +6,8 @@ import json
 
 import pytest
 
+from ihbench.diffusion.inpaint_config import FULL
 from ihbench.diffusion.mini.weights import save_mini
-from ihbench.methods.inpainthuman.studies.paint_rows import FULL
 from ihbench.methods.inpainthuman.studies.paint_table import summary, table
 from tests.diffusion.tiny_diffusion import tiny_backbone
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,5 +45,4 @@ def paste_back(
         mask, kept = original.mask.copy(), original.image
     mask[asked] = found[asked]
     image = np.where(asked[..., None], image, kept)
-    view = TrainView(image, mask, shown.camera, shown.body_pose, shown.frame, shown.camera_id)
-    return PaintedView(crop_view.index, view, asked)
+    return PaintedView(crop_view.index, replace(shown, image=image, mask=mask), asked)

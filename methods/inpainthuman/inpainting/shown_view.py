@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -35,7 +36,7 @@ def with_known_surface(view: TrainView, training: TrainingSet, avatar: Renderer,
     image, mask = view.image.copy(), view.mask.copy()
     image[known] = np.rint(rgb[known] * 255).astype(np.uint8)
     mask[known] = np.where(alpha[known] >= 0.5, MaskState.PERSON, MaskState.BACKGROUND)
-    return TrainView(image, mask, view.camera, view.body_pose, view.frame, view.camera_id)
+    return replace(view, image=image, mask=mask)
 
 
 def turntable_view(

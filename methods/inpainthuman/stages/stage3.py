@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from torch import Tensor
@@ -137,5 +137,4 @@ class Stage3(Optimisation):
 
 def _never_taken(view: TrainView) -> TrainView:
     """The view without anything that stage 1's loss could count."""
-    mask = np.full_like(view.mask, MaskState.UNKNOWN)
-    return TrainView(view.image, mask, view.camera, view.body_pose, view.frame, view.camera_id)
+    return replace(view, mask=np.full_like(view.mask, MaskState.UNKNOWN))

@@ -13,9 +13,10 @@ from typing import Annotated, Any, Literal
 from ihbench.bounds import SEEDS, Within, refuse_repeated
 from ihbench.commands.options.device import check_device
 from ihbench.commands.options.scene_choice import ProtocolChanges
-from ihbench.diffusion.inpaint_config import InpaintConfig
+from ihbench.diffusion.inpaint_config import COMPONENTS, SIMPLE, InpaintConfig
 from ihbench.errors import BadInput
-from ihbench.methods.inpainthuman.studies.paint_rows import ROWS
+
+ROWS = (*SIMPLE, *COMPONENTS)
 
 
 @dataclass(frozen=True, kw_only=True)

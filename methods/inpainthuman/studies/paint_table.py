@@ -14,9 +14,8 @@ from ihbench.body import Body
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.diffusion.crops.crop_view import CropView, cut_view
-from ihbench.diffusion.inpaint_config import InpaintConfig
+from ihbench.diffusion.inpaint_config import COMPONENTS, FULL, SIMPLE, InpaintConfig
 from ihbench.errors import BadInput
-from ihbench.methods.inpainthuman.studies.paint_rows import DIFFUSION, FILLS, FULL
 from ihbench.metrics.statistics import mean_interval, paired_test
 from ihbench.scene.contracts import Capture
 from ihbench.scene.protocol import Protocol
@@ -60,7 +59,7 @@ def paint_scene(
     pictures: dict[str, NDArray[np.uint8]] = {}
     for row in rows:
         scored = []
-        for seed in seeds if row in DIFFUSION else seeds[:1]:
+        for seed in seeds if row in COMPONENTS else seeds[:1]:
             ledger = Ledger()
             with ledger.stage("paint"):
                 painted = _paint(
@@ -93,14 +92,14 @@ def _paint(
     progress: Progress,
     device: str,
 ) -> list[NDArray[np.uint8]]:
-    if row in FILLS:
+    if row in SIMPLE:
         from ihbench.methods.inpainthuman.inpainting.simple_inpainters import simple_inpainters
 
         painted = simple_inpainters(body, background)[row].inpaint(views, progress)
         return [painted[k] for k in chosen]
     from ihbench.diffusion.diffusion_inpainter import DiffusionInpainter, load_backbone
 
-    ti, lora, sg = DIFFUSION[row]
+    ti, lora, sg = COMPONENTS[row]
     switched = replace(config, ti=ti, lora=lora, sg=sg)
     inpainter = DiffusionInpainter(load_backbone(switched, device), switched, seed, ledger)
     if ti or lora:  # a generic model learns nothing of the person, its ControlNet neither
