@@ -30,8 +30,9 @@ from numpy.typing import NDArray
 from ihbench.body import Body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera, off_orthogonal
-from ihbench.datasets.reading.capture_folder import BY_OPTIONS, CaptureFolder
+from ihbench.datasets.reading.capture_folder import CaptureFolder
 from ihbench.datasets.reading.pickles import write_pickle
+from ihbench.datasets.reading.stored_numbers import described, numbers
 from ihbench.datasets.reading.subject_folders import SubjectFolders, View, count_files
 from ihbench.errors import BadInput
 from ihbench.files import atomic
@@ -373,32 +374,6 @@ def _where_else(root: Path) -> str:
 # ------------------------------------------------------------------------------- checked values of both
 
 
-def numbers(content: Mapping, key: str, shape: tuple[int, ...], where: str) -> Array:
-    """One entry as finite float64 of a shape, where -1 is any length. Rows and columns pass as vectors, 72 numbers as
-    [24, 3]. Raises `BadInput` that starts with `where`."""
-    sides = ", ".join("n" if side < 0 else str(side) for side in shape)
-    wanted = f"expected {key!r} to be numbers of shape [{sides}]"
-    if key not in content:
-        raise BadInput(f"{where}: {wanted}, found no such key")
-    try:
-        value = np.asarray(content[key], np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise BadInput(f"{where}: {wanted}, found {described(content[key])} of other contents") from None
-    if shape == (24, 3) and value.size == 72:
-        value = value.reshape(24, 3)
-    if not _fits(value.shape, shape):
-        if not _fits(value.squeeze().shape, shape):
-            raise BadInput(f"{where}: {wanted}, found {list(value.shape)}")
-        value = value.squeeze()
-    if not np.isfinite(value).all():
-        raise BadInput(f"{where}: NaN or infinity in {key!r}; leave this frame out {BY_OPTIONS}")
-    return value
-
-
-def _fits(found: tuple[int, ...], wanted: tuple[int, ...]) -> bool:
-    return len(found) == len(wanted) and all(a == b or (b < 0 < a) for a, b in zip(found, wanted, strict=True))
-
-
 def metric_pose(pose: Array, betas: Array, trans: Array, where: str) -> BodyPose:
     """SMPL parameters in radians and metres. Raises `BadInput` for those that are in degrees or millimetres."""
     turn = np.linalg.norm(pose, axis=1).max()
@@ -444,15 +419,6 @@ def check_calibration(K: Array, E: Array, where: str) -> None:
             f"{where}: the camera stands {np.linalg.norm(E[:3, 3]):.4g} from the origin; expected metres, divide the "
             f"extrinsics' t by 1000 if it is in millimetres"
         )
-
-
-def described(value: object) -> str:
-    if isinstance(value, dict):
-        keys = sorted(str(key)[:20] for key in value)
-        return f"a dictionary with {', '.join(keys[:6]) or 'nothing'}{', …' if len(keys) > 6 else ''}"
-    if isinstance(value, np.ndarray):
-        return f"a {value.dtype} array of shape {list(value.shape)}"
-    return f"a {type(value).__name__}"
 
 
 # ----------------------------------------------------------------------------------------------- write

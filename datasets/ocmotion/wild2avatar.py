@@ -31,15 +31,14 @@ from ihbench.datasets.ocmotion.original import (
     OneCameraCapture,
     Sequences,
     check_calibration,
-    described,
     mask_png,
     metric_pose,
-    numbers,
     one_camera,
     stored_camera,
     ten_betas,
 )
 from ihbench.datasets.reading.pickles import write_pickle
+from ihbench.datasets.reading.stored_numbers import described, numbers
 from ihbench.datasets.reading.subject_folders import View
 from ihbench.errors import BadInput
 from ihbench.files import atomic

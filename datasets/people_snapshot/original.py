@@ -36,6 +36,7 @@ from ihbench.camera import Camera, off_orthogonal
 from ihbench.datasets.reading.capture_folder import BY_OPTIONS, CaptureFolder
 from ihbench.datasets.reading.pickles import write_pickle
 from ihbench.datasets.reading.plausibility import share_inside
+from ihbench.datasets.reading.stored_numbers import numbers
 from ihbench.datasets.reading.subject_folders import SubjectFolders, View
 from ihbench.errors import BadInput
 from ihbench.files import atomic, npz
@@ -303,7 +304,7 @@ def read_camera(path: Path) -> Camera:
     if not isinstance(content, dict):
         raise BadInput(f"{path}: expected a dictionary with camera_f, camera_c, …, found a {type(content).__name__}")
     content = {"camera_t": np.zeros(3), "camera_rt": np.zeros(3)} | content
-    values = {key: _numbers(content, key, size, path) for key, size in CAMERA_SIZES.items()}
+    values = {key: numbers(content, key, (size,), path) for key, size in CAMERA_SIZES.items()}
     width, height = float(values["width"][0]), float(values["height"][0])
     if not (width.is_integer() and height.is_integer() and 1 <= width <= 65535 and 1 <= height <= 65535):
         raise BadInput(f"{path}: expected width and height in whole pixels, found {width:g} and {height:g}")
@@ -313,21 +314,6 @@ def read_camera(path: Path) -> Camera:
     K = np.array([[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1]])
     R = axis_angle_to_matrix(values["camera_rt"])
     return Camera.from_opencv(K, R, values["camera_t"], int(width), int(height), values["camera_k"])
-
-
-def _numbers(content: dict, key: str, size: int, path: Path) -> NDArray[np.float64]:
-    wanted = f"expected {size} number{'s' if size > 1 else ''} in {key!r}"
-    if key not in content:
-        raise BadInput(f"{path}: {wanted}, found no such key; copy the file again")
-    try:
-        value = np.asarray(content[key], np.float64).reshape(-1)
-    except (TypeError, ValueError):
-        raise BadInput(f"{path}: {wanted}, found a {type(content[key]).__name__}") from None
-    if value.size != size:
-        raise BadInput(f"{path}: {wanted}, found {value.size}")
-    if not np.isfinite(value).all():
-        raise BadInput(f"{path}: {wanted}, found NaN or infinity in it")
-    return value
 
 
 def read_poses(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -355,13 +341,7 @@ def finite_pose(path: Path, index: int, pose: NDArray, trans: NDArray, betas: ND
 def read_consensus(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(betas [10], v_personal [V, 3] m: offsets of the template's vertices). Raises `BadInput`."""
     content = load_pickle(path)
-    if not isinstance(content, dict) or not {"betas", "v_personal"} <= content.keys():
-        raise BadInput(f"{path}: expected a dictionary with 'betas' and 'v_personal', found something else")
-    betas = _numbers(content, "betas", 10, path)
-    v_personal = content["v_personal"]
-    if not isinstance(v_personal, np.ndarray) or v_personal.ndim != 2 or v_personal.shape[1] != 3:
-        raise BadInput(f"{path}: expected an array of shape [V, 3] in 'v_personal', found something else")
-    return betas, _numbers(content, "v_personal", v_personal.size, path).reshape(-1, 3)
+    return numbers(content, "betas", (10,), path), numbers(content, "v_personal", (-1, 3), path)
 
 
 def read_keypoints(path: Path) -> NDArray[np.float64]:

@@ -33,6 +33,7 @@ from ihbench.camera import Camera, off_orthogonal
 from ihbench.datasets.reading.capture_folder import CaptureFolder, Picture
 from ihbench.datasets.reading.plausibility import SOFT_VALUES, Outline
 from ihbench.datasets.reading.standin_mark import STANDIN_FILE
+from ihbench.datasets.reading.stored_numbers import numbers
 from ihbench.datasets.reading.subject_folders import SubjectFolders, View
 from ihbench.errors import BadInput, BadValue
 from ihbench.files import atomic
@@ -283,7 +284,7 @@ def _camera(name: str, entry: Any, path: Path) -> Camera:
         if key not in CAMERA_KEYS:
             raise BadInput(f"{where}: unknown key {key!r}: {nearest(key, list(CAMERA_KEYS))}")
     width, height = (_pixels(entry, key, where) for key in ("width", "height"))
-    K, R, t = (_numbers(entry, key, shape, where) for key, shape in (("K", (3, 3)), ("R", (3, 3)), ("t", (3,))))
+    K, R, t = (numbers(entry, key, shape, where) for key, shape in (("K", (3, 3)), ("R", (3, 3)), ("t", (3,))))
     if K[0, 0] <= 0 or K[1, 1] <= 0 or K[1, 0] != 0 or not np.array_equal(K[2], [0, 0, 1]):
         raise BadInput(f"{where}: K: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0; check the signs")
     if off_orthogonal(R) > 1e-3:
@@ -292,7 +293,7 @@ def _camera(name: str, entry: Any, path: Path) -> Camera:
         raise BadInput(f"{where}: R: expected a rotation, found a reflection (a left-handed world); flip one axis")
     distortion = None
     if entry.get("distortion") is not None:
-        distortion = _numbers(entry, "distortion", (5,), where)
+        distortion = numbers(entry, "distortion", (5,), where)
     center = entry.get("pixel_center", 0.0)
     if isinstance(center, bool) or center not in (0, 0.5):
         raise BadInput(f"{where}: pixel_center: expected 0.0 or 0.5, the centre of the first pixel; found {center!r}")
@@ -304,19 +305,6 @@ def _pixels(entry: dict[str, Any], key: str, where: str) -> int:
     value = entry.get(key)
     if type(value) is not int or not 0 < value <= 2**16:
         raise BadInput(f"{where}: {key}: expected a whole number of pixels, found {_shown(value)}")
-    return value
-
-
-def _numbers(entry: dict[str, Any], key: str, shape: tuple[int, ...], where: str) -> Array:
-    wanted = f"{where}: {key}: expected finite numbers of shape {list(shape)}"
-    if key not in entry:
-        raise BadInput(f"{wanted}, found no such key")
-    try:
-        value = np.array(entry[key], np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise BadInput(f"{wanted}, found {_shown(entry[key])}") from None
-    if value.shape != shape or not np.isfinite(value).all():
-        raise BadInput(f"{wanted}, found {list(value.shape) if value.shape != shape else 'NaN or infinity'}")
     return value
 
 
@@ -441,11 +429,11 @@ def _check_files(capture: PlainCapture, report: SubjectReport) -> None:
             "image": (posed - images.keys(), f"poses have no image{here}"),
             "mask": (images.keys() & posed - masks.keys(), f"images{here} have no mask"),
         }
-        for what, (numbers, text) in lacks.items():
-            missing[what] += len(numbers)
-            if numbers and not (capture.standin and what == "image"):
+        for what, (lacking, text) in lacks.items():
+            missing[what] += len(lacking)
+            if lacking and not (capture.standin and what == "image"):
                 report.problem(
-                    f"{len(numbers)} {text}; the first is frame {min(numbers)}: copy the files, or leave "
+                    f"{len(lacking)} {text}; the first is frame {min(lacking)}: copy the files, or leave "
                     f"these frames out of {POSES_FILE}"
                 )
         for listing in (images, masks):

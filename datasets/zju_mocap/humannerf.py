@@ -27,6 +27,7 @@ from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.datasets.reading.capture_folder import CaptureFolder, Picture
 from ihbench.datasets.reading.pickles import write_pickle
+from ihbench.datasets.reading.stored_numbers import described, numbers
 from ihbench.datasets.reading.subject_folders import SubjectFolders, View, count_files
 from ihbench.errors import BadInput
 from ihbench.files import atomic
@@ -99,9 +100,9 @@ class HumanNerfCapture(CaptureFolder):
         first = min(frame for other, frame in self._names if other == own)
         name = self._names[own, first]
         entry, path = self._cameras[name], self.folder / "cameras.pkl"
-        K = _numbers(entry, "intrinsics", (3, 3), path, name)
-        E = _numbers(entry, "extrinsics", (4, 4), path, name)
-        D = _numbers(entry, "distortions", (5,), path, name) if "distortions" in entry else None
+        K = numbers(entry, "intrinsics", (3, 3), f"{path}: {name}")
+        E = numbers(entry, "extrinsics", (4, 4), f"{path}: {name}")
+        D = numbers(entry, "distortions", (5,), f"{path}: {name}") if "distortions" in entry else None
         if camera not in self._sizes:
             self._sizes[camera] = size_of(self.picture("images", camera, first))
         return Camera.from_opencv(K, E[:3, :3], E[:3, 3], *self._sizes[camera], D)
@@ -113,7 +114,7 @@ class HumanNerfCapture(CaptureFolder):
         if name is None:
             raise BadInput(f"{path}: no pose of frame {frame}; expected one for every frame of cameras.pkl")
         info = self._infos[name]
-        poses, Rh, Th = (_numbers(info, k, (n,), path, name) for k, n in (("poses", 72), ("Rh", 3), ("Th", 3)))
+        poses, Rh, Th = (numbers(info, k, (n,), f"{path}: {name}") for k, n in (("poses", 72), ("Rh", 3), ("Th", 3)))
         try:
             return from_zju_root(poses, self._betas(info, path, name), Rh, Th, self.model)
         except BadInput as error:
@@ -121,24 +122,24 @@ class HumanNerfCapture(CaptureFolder):
 
     def _betas(self, info: Mapping[str, Any], path: Path, name: str) -> NDArray[np.float64]:
         if "betas" in info:
-            return _numbers(info, "betas", None, path, name)
+            return numbers(info, "betas", (-1,), f"{path}: {name}")
         if self._average_betas is not None:
             return self._average_betas
-        joints = _numbers(info, "tpose_joints", (24, 3), path, name)
+        joints = numbers(info, "tpose_joints", (24, 3), f"{path}: {name}")
         key = joints.tobytes()
-        if key not in self._found_betas:
-            self._found_betas[key] = betas_of_joints(joints, self.model)
-        return self._found_betas[key]
+        if key not in self._fitted_betas:
+            self._fitted_betas[key] = betas_of_joints(joints, self.model)
+        return self._fitted_betas[key]
 
     @cached_property
-    def _found_betas(self) -> dict[bytes, NDArray[np.float64]]:
+    def _fitted_betas(self) -> dict[bytes, NDArray[np.float64]]:
         return {}
 
     @cached_property
     def _average_betas(self) -> NDArray[np.float64] | None:
         path = self.folder / "canonical_joints.pkl"
-        found = _dictionary(path) if path.is_file() else {}
-        return _numbers(found, "avg_betas", None, path, "") if "avg_betas" in found else None
+        content = _dictionary(path) if path.is_file() else {}
+        return numbers(content, "avg_betas", (-1,), path) if "avg_betas" in content else None
 
     @property
     def views(self) -> list[View]:
@@ -188,26 +189,10 @@ def betas_of_joints(joints: NDArray[np.float64], body: Body) -> NDArray[np.float
 
 
 def _dictionary(path: Path) -> dict[str, Any]:
-    found = load_pickle(path)
-    if not isinstance(found, dict) or not found:
-        raise BadInput(f"{path}: expected a dictionary with entries, found {type(found).__name__}")
-    return found
-
-
-def _numbers(entry: Any, key: str, shape: tuple[int, ...] | None, path: Path, name: str) -> NDArray[np.float64]:
-    wanted = f"{path}: {name}: expected {key!r}" + (f" of shape {list(shape)}" if shape else "")
-    if not isinstance(entry, Mapping) or key not in entry:
-        raise BadInput(f"{wanted}, found no such key")
-    try:
-        value = np.asarray(entry[key], np.float64)
-    except (TypeError, ValueError):
-        raise BadInput(f"{wanted}, found {type(entry[key]).__name__}") from None
-    value = value.reshape(-1) if shape is None or len(shape) == 1 else value
-    if shape is not None and value.shape != shape:
-        raise BadInput(f"{wanted}, found {list(value.shape)}")
-    if not np.isfinite(value).all():
-        raise BadInput(f"{wanted}, found NaN or infinity in it")
-    return value
+    content = load_pickle(path)
+    if not isinstance(content, dict) or not content:
+        raise BadInput(f"{path}: expected a dictionary with entries, found {described(content)}")
+    return content
 
 
 # ----------------------------------------------------------------------------------------------- write

@@ -26,9 +26,10 @@ from numpy.typing import NDArray
 from ihbench.body import Body, from_zju_root, zju_root
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera, off_orthogonal
-from ihbench.datasets.reading.capture_folder import BY_OPTIONS, CaptureFolder
+from ihbench.datasets.reading.capture_folder import CaptureFolder
 from ihbench.datasets.reading.pickles import write_object
 from ihbench.datasets.reading.plausibility import Outline
+from ihbench.datasets.reading.stored_numbers import described, numbers
 from ihbench.datasets.reading.subject_folders import SubjectFolders, View, count_files
 from ihbench.errors import BadInput
 from ihbench.files import atomic
@@ -137,7 +138,7 @@ class ZjuCapture(CaptureFolder):
             raise missing_file(path, f"expected the body's vertices at frame {frame}")
         vertices = load_npy(path)
         if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.dtype.kind != "f":
-            raise BadInput(f"{path}: expected numbers of shape [V, 3] in metres, found {_shape_of(vertices)}")
+            raise BadInput(f"{path}: expected numbers of shape [V, 3] in metres, found {described(vertices)}")
         if not np.isfinite(vertices).all():
             raise BadInput(f"{path}: NaN or infinite vertices; expected finite metres")
         return vertices.astype(np.float64)
@@ -227,9 +228,9 @@ def read_annots(path: Path) -> Annots:
     content = load_npy(path)
     content = content.item() if content.shape == () and content.dtype == object else None
     if not isinstance(content, dict) or not {"cams", "ims"} <= content.keys():
-        raise BadInput(f"{path}: expected a dictionary with 'cams' and 'ims', found {_described(content)}")
+        raise BadInput(f"{path}: expected a dictionary with 'cams' and 'ims', found {described(content)}")
     if not isinstance(content["cams"], dict):
-        raise BadInput(f"{path}: expected 'cams' to be a dictionary, found {_described(content['cams'])}")
+        raise BadInput(f"{path}: expected 'cams' to be a dictionary, found {described(content['cams'])}")
     cameras = {key: _camera_field(content["cams"], key, path) for key in CAMERA_SHAPES}
     counts = {key: len(value) for key, value in cameras.items()}
     n_cameras = counts["K"]
@@ -250,7 +251,7 @@ def _camera_field(cams: dict, key: str, path: Path) -> NDArray[np.float64]:
     try:
         stacked = np.array([np.asarray(value, np.float64) for value in cams[key]])
     except (TypeError, ValueError):
-        raise BadInput(f"{path}: {wanted}, found {_described(cams[key])} of other contents") from None
+        raise BadInput(f"{path}: {wanted}, found {described(cams[key])} of other contents") from None
     flat_vector = len(shape) == 1 and stacked.ndim == 3 and 1 in stacked.shape[1:]
     if flat_vector:  # stored as a column or a row
         stacked = stacked.reshape(len(stacked), -1)
@@ -279,7 +280,7 @@ def _image_paths(ims: Any, n_cameras: int, path: Path) -> list[tuple[str, ...]]:
     try:
         frames = [tuple(str(image) for image in frame["ims"]) for frame in ims]
     except (TypeError, KeyError, IndexError):
-        raise BadInput(f"{path}: {wanted}, found {_described(ims)} of other contents") from None
+        raise BadInput(f"{path}: {wanted}, found {described(ims)} of other contents") from None
     if not frames:
         raise BadInput(f"{path}: {wanted}, found no frame")
     for index, frame in enumerate(frames):
@@ -302,19 +303,14 @@ def read_params(path: Path) -> tuple[NDArray[np.float64], ...]:
     content = content.item() if content.shape == () and content.dtype == object else None
     sizes = {"poses": (72, 69), "shapes": (10, 300), "Rh": (3,), "Th": (3,)}
     if not isinstance(content, dict) or not sizes.keys() <= content.keys():
-        raise BadInput(f"{path}: expected a dictionary with poses, shapes, Rh and Th, found {_described(content)}")
+        raise BadInput(f"{path}: expected a dictionary with poses, shapes, Rh and Th, found {described(content)}")
     values = []
     for key, allowed in sizes.items():
-        try:
-            value = np.asarray(content[key], np.float64).reshape(-1)
-        except (TypeError, ValueError):
-            raise BadInput(f"{path}: expected numbers in {key!r}, found {_described(content[key])}") from None
+        value = numbers(content, key, (-1,), path)
         if value.size not in allowed:
             raise BadInput(
                 f"{path}: expected {' or '.join(str(n) for n in allowed)} numbers in {key!r}, found {value.size}"
             )
-        if not np.isfinite(value).all():
-            raise BadInput(f"{path}: NaN or infinity in {key!r}; leave this frame out {BY_OPTIONS}")
         values.append(value)
     return tuple(values)
 
@@ -331,16 +327,6 @@ def _frame_number(image: str, folder: Path) -> int:
 
 def _natural(name: str) -> list[tuple[int, int | str]]:
     return [(0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", name) if part]
-
-
-def _described(value: object) -> str:
-    if isinstance(value, dict):
-        return f"a dictionary with {', '.join(sorted(str(key) for key in value)) or 'nothing'}"
-    return _shape_of(value) if isinstance(value, np.ndarray) else f"a {type(value).__name__}"
-
-
-def _shape_of(array: NDArray) -> str:
-    return f"a {array.dtype} array of shape {list(array.shape)}"
 
 
 # ----------------------------------------------------------------------------------------------- write

@@ -312,7 +312,7 @@ def test_camera_folder_missing(copy):
         ({"Th": np.array([[np.inf, 0, 0]])}, "NaN or infinity in 'Th'"),
         ({"poses": np.zeros((1, 71))}, "expected 72 or 69 numbers in 'poses', found 71"),
         ({"shapes": np.zeros((1, 3))}, "numbers in 'shapes', found 3"),
-        ({"Th": "here"}, "expected numbers in 'Th'"),
+        ({"Th": "here"}, "expected 'Th' to be numbers"),
         ({"poses": np.ones((1, 72))}, "expected zeros in its first three"),
     ],
 )

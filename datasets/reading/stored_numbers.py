@@ -1,0 +1,53 @@
+"""Numbers out of dictionaries that other people's programs stored, checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench.datasets.reading.capture_folder import BY_OPTIONS
+from ihbench.errors import BadInput
+
+
+def numbers(content: Any, key: str, shape: tuple[int, ...], where: object) -> NDArray[np.float64]:
+    """One entry as finite float64 of a shape, where -1 is any length; a new array.
+
+    Rows and columns pass as vectors, 72 numbers as [24, 3]. Raises `BadInput` that starts with `where`.
+    """
+    sides = ", ".join("n" if side < 0 else str(side) for side in shape)
+    expected = f"{where}: expected {key!r} to be numbers of shape [{sides}]"
+    if not isinstance(content, Mapping) or key not in content:
+        raise BadInput(f"{expected}, found no such key")
+    try:
+        value = np.array(content[key], np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise BadInput(f"{expected}, found {described(content[key])} of other contents") from None
+    if shape == (24, 3) and value.size == 72:
+        value = value.reshape(24, 3)
+    if not _fits(value.shape, shape):
+        squeezed = value.reshape(1) if value.size == 1 else value.squeeze()
+        if not _fits(squeezed.shape, shape):
+            raise BadInput(f"{expected}, found {list(value.shape)}")
+        value = squeezed
+    if not np.isfinite(value).all():
+        raise BadInput(
+            f"{where}: NaN or infinity in {key!r}; expected finite numbers, leave a frame out {BY_OPTIONS}"
+        )
+    return value
+
+
+def _fits(shape: tuple[int, ...], expected: tuple[int, ...]) -> bool:
+    return len(shape) == len(expected) and all(a == b or (b < 0 < a) for a, b in zip(shape, expected, strict=True))
+
+
+def described(value: object) -> str:
+    """What a value is, for messages."""
+    if isinstance(value, dict):
+        keys = sorted(str(key)[:20] for key in value)
+        return f"a dictionary with {', '.join(keys[:6]) or 'nothing'}{', …' if len(keys) > 6 else ''}"
+    if isinstance(value, np.ndarray):
+        return f"a {value.dtype} array of shape {list(value.shape)}"
+    return f"a {type(value).__name__}"
