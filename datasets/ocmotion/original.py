@@ -274,7 +274,7 @@ class _Track:
 def _tracks(path: Path, _version: tuple[int, int, int]) -> dict[str, _Track]:
     """Subjects of one annotation file; another version of the file is another call."""
     content = load_pickle(path)
-    found: dict[str, _Track] = {}
+    tracks: dict[str, _Track] = {}
     for s, cameras in enumerate(_listed(content, f"{path}", "a list of sequences")):
         for c, frames in enumerate(_listed(cameras, f"{path}: sequence {s}", "a list of cameras")):
             where = f"{path}: sequence {s}, camera {c}"
@@ -291,20 +291,20 @@ def _tracks(path: Path, _version: tuple[int, int, int]) -> dict[str, _Track]:
                 suffix = f"_p{person}" if k else ""
                 folder = PurePosixPath(_image_name(*own[0])).parent
                 name = "_".join(_without_images(folder).parts) or f"{s:04d}_{c:02d}"
-                if name + suffix in found:
+                if name + suffix in tracks:
                     raise BadInput(
                         f"{where}: its images lie in {folder}, as do those of another camera of this file; "
                         f"expected one folder for each camera"
                     )
-                found[name + suffix] = _Track(path, person, suffix, own)
-    return found
+                tracks[name + suffix] = _Track(path, person, suffix, own)
+    return tracks
 
 
-def _listed(value: Any, where: str, wanted: str) -> list:
+def _listed(value: Any, where: str, expected: str) -> list:
     if isinstance(value, np.ndarray) and value.dtype == object:
         value = value.tolist()
     if not isinstance(value, list | tuple):
-        raise BadInput(f"{where}: expected {wanted}, found {described(value)}; get OcMotion's annot/ again")
+        raise BadInput(f"{where}: expected {expected}, found {described(value)}; get OcMotion's annot/ again")
     return list(value)
 
 

@@ -173,10 +173,10 @@ class W2aCapture(OneCameraCapture):
         return _read_frames(self.folder / "all_cameras.pkl", self.frame_names)
 
 
-def _holds(E: Array, wanted: Array) -> bool:
+def _holds(E: Array, own: Array) -> bool:
     """Whether one of the extrinsics [N, 4, 4] is the wanted one [4, 4]."""
-    scale = max(1.0, float(np.abs(wanted).max()))
-    return bool((np.abs(E - wanted).max((1, 2)) < SAME_EXTRINSICS * scale).any())
+    scale = max(1.0, float(np.abs(own).max()))
+    return bool((np.abs(E - own).max((1, 2)) < SAME_EXTRINSICS * scale).any())
 
 
 def camera_id(name: str) -> str:
@@ -213,18 +213,18 @@ def _image_files(folder: Path, may_lack: bool) -> dict[str, Path]:
         if may_lack:
             return {}
         raise BadInput(f"{folder}: no such folder; expected the images of the sequence, NNNNN.png")
-    found: dict[str, Path] = {}
+    files: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() not in PICTURES or path.name.startswith("."):
             continue
-        if path.stem in found:
-            raise BadInput(f"{path}: frame {path.stem} is there twice, {found[path.stem].name} too; keep one of them")
+        if path.stem in files:
+            raise BadInput(f"{path}: frame {path.stem} is there twice, {files[path.stem].name} too; keep one of them")
         if not (path.stem[:5].isascii() and path.stem[:5].isdecimal()):
             raise BadInput(f"{path}: expected the frame's number in the first five characters of the name")
-        found[path.stem] = path
-    if not found and not may_lack:
+        files[path.stem] = path
+    if not files and not may_lack:
         raise BadInput(f"{folder}: no image in it; expected those of the sequence, NNNNN.png")
-    return found
+    return files
 
 
 def _frame_names(files: dict[str, Path], metadata: dict, folder: Path, standin: bool) -> tuple[str, ...]:

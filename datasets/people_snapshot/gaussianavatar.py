@@ -225,14 +225,14 @@ def read_poses(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], ND
     values = []
     for key, size in sizes.items():
         value = content[key]
-        wanted = "[1, 10]" if key == "beta" else f"[N, {size}]"
+        expected_shape = "[1, 10]" if key == "beta" else f"[N, {size}]"
         real = isinstance(value, torch.Tensor) and not (value.is_complex() or value.is_sparse or value.is_quantized)
         if not real or value.layout != torch.strided or value.device.type != "cpu":
-            raise BadInput(f"{path}: expected a tensor {wanted} in {key!r}, found a {type(value).__name__}")
+            raise BadInput(f"{path}: expected a tensor {expected_shape} in {key!r}, found a {type(value).__name__}")
         value = value.detach().to(torch.float64).numpy()
         value = value.reshape(-1) if key == "beta" else value
         if value.shape[-1:] != (size,) or value.ndim != (1 if key == "beta" else 2):
-            raise BadInput(f"{path}: expected shape {wanted} in {key!r}, found {list(content[key].shape)}")
+            raise BadInput(f"{path}: expected shape {expected_shape} in {key!r}, found {list(content[key].shape)}")
         values.append(value)
     pose, trans, beta = values
     if len(pose) != len(trans):

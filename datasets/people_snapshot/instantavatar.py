@@ -149,8 +149,8 @@ class InstantAvatarCapture(SnapshotPictures):
 def _numbered_images(folder: Path) -> list[int]:
     if not folder.is_dir():
         return []
-    found = (IMAGE_NAME.fullmatch(path.name) for path in folder.iterdir())
-    return sorted(int(match[1]) for match in found if match)
+    matches = (IMAGE_NAME.fullmatch(path.name) for path in folder.iterdir())
+    return sorted(int(match[1]) for match in matches if match)
 
 
 def read_camera(path: Path) -> Camera:

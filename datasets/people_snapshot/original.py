@@ -276,8 +276,8 @@ def video_path(folder: Path) -> Path:
     others = [other for other in sorted(folder.iterdir()) if other.suffix.lower() == ".mp4" and other.name[0] != "."]
     if len(others) == 1:
         return others[0]
-    found = f"{len(others)} other .mp4 files, none of this name" if others else "no .mp4 file"
-    raise missing_file(path, f"expected the subject's video, found {found}; copy it here")
+    instead = f"{len(others)} other .mp4 files, none of this name" if others else "no .mp4 file"
+    raise missing_file(path, f"expected the subject's video, found {instead}; copy it here")
 
 
 def report_spoiled_rows(report: SubjectReport, path: Path, *arrays: NDArray) -> None:
@@ -350,22 +350,22 @@ def read_keypoints(path: Path) -> NDArray[np.float64]:
         return _read_dataset(file, "keypoints", (None, 3 * N_KEYPOINTS), path).reshape(-1, N_KEYPOINTS, 3)
 
 
-def read_npz(path: Path, wanted: dict[str, tuple[int | None, ...] | None]) -> dict[str, NDArray]:
+def read_npz(path: Path, shapes: dict[str, tuple[int | None, ...] | None]) -> dict[str, NDArray]:
     """Arrays of numbers from an .npz file by name; a shape's None stands for any length, a shape None for any shape.
 
     A name that ends in "?" may be missing. Raises `BadInput` for a damaged file, a missing name or another shape.
     """
     if not path.is_file():
-        raise missing_file(path, f"expected {', '.join(name.rstrip('?') for name in wanted)} in it")
-    found = npz.read_npz(path)
-    for name in wanted:
-        if name.rstrip("?") not in found and not name.endswith("?"):
-            raise BadInput(f"{path}: expected {name!r} in it, found {', '.join(sorted(found)) or 'nothing'}")
-    for name, shape in wanted.items():
-        array = found.get(name.rstrip("?"))
+        raise missing_file(path, f"expected {', '.join(name.rstrip('?') for name in shapes)} in it")
+    arrays = npz.read_npz(path)
+    for name in shapes:
+        if name.rstrip("?") not in arrays and not name.endswith("?"):
+            raise BadInput(f"{path}: expected {name!r} in it, found {', '.join(sorted(arrays)) or 'nothing'}")
+    for name, shape in shapes.items():
+        array = arrays.get(name.rstrip("?"))
         if array is not None:
             _check_array(array.dtype, array.shape, shape, f"{path}: expected {name.rstrip('?')!r}")
-    return {key: found[key] for key in (name.rstrip("?") for name in wanted) if key in found}
+    return {key: arrays[key] for key in (name.rstrip("?") for name in shapes) if key in arrays}
 
 
 def rigid_extrinsic(extrinsic: NDArray, path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -381,15 +381,17 @@ def rigid_extrinsic(extrinsic: NDArray, path: Path) -> tuple[NDArray[np.float64]
     return R, extrinsic[:3, 3]
 
 
-def _check_array(dtype: np.dtype, shape: tuple[int, ...], wanted: tuple[int | None, ...] | None, start: str) -> None:
+def _check_array(
+    dtype: np.dtype, shape: tuple[int, ...], expected: tuple[int | None, ...] | None, start: str
+) -> None:
     if dtype.kind not in "biuf":
         raise BadInput(f"{start} to hold numbers, found {dtype}")
-    fits = wanted is None or (
-        len(shape) == len(wanted) and all(b in (None, a) for a, b in zip(shape, wanted, strict=True))
+    fits = expected is None or (
+        len(shape) == len(expected) and all(b in (None, a) for a, b in zip(shape, expected, strict=True))
     )
     if not fits:
-        assert wanted is not None
-        spelled = ", ".join("N" if n is None else str(n) for n in wanted)
+        assert expected is not None
+        spelled = ", ".join("N" if n is None else str(n) for n in expected)
         raise BadInput(f"{start} of shape [{spelled}], found {list(shape)}")
 
 
@@ -411,8 +413,8 @@ def _dataset(file: h5py.File, name: str, shape: tuple[int | None, ...] | None, p
 
     try:
         if not isinstance(file.get(name, getlink=True), h5py.HardLink):  # a link may lead into other files
-            found = ", ".join(sorted(file)) or "nothing"
-            raise BadInput(f"{path}: expected a data set {name!r} in it, found {found}; copy the file again")
+            names = ", ".join(sorted(file)) or "nothing"
+            raise BadInput(f"{path}: expected a data set {name!r} in it, found {names}; copy the file again")
         dataset = file[name]
         if not isinstance(dataset, h5py.Dataset) or dataset.is_virtual or dataset.external:
             raise BadInput(f"{path}: expected {name!r} to be a data set of its own, found something else")
@@ -518,13 +520,13 @@ class Video:
                 self._kept.popitem(last=False)
             return image.copy()
 
-    def _step(self, decoded: bool, wanted: int) -> None:
+    def _step(self, decoded: bool, number: int) -> None:
         if decoded:
             self._next += 1
             return
         ended, self._next = self._next, 1 << 62  # the stream is spent: start over at the next call
         raise BadInput(
-            f"{self.path}: ends after {ended} frames, but frame {wanted} was asked for and its header promises "
+            f"{self.path}: ends after {ended} frames, but frame {number} was asked for and its header promises "
             f"{self.n_frames}; copy the file again"
         )
 

@@ -186,10 +186,10 @@ class PlainCapture(CaptureFolder):
 
     def files_of(self, camera: int, frame: int, source: str) -> tuple[Path, ...]:
         number = self.number(frame)
-        found = [self.files(kind, camera).get(number, []) for kind in ("images", "masks")]
-        if not all(found):
+        listings = [self.files(kind, camera).get(number, []) for kind in ("images", "masks")]
+        if not all(listings):
             raise BadInput(f"{self.folder}: no image or mask of frame {number}")
-        return tuple(path for paths in found for path in paths)
+        return tuple(path for paths in listings for path in paths)
 
     def stored_pose(self, frame: int) -> BodyPose:
         self.check_index(0, frame)

@@ -130,8 +130,8 @@ def _foot_points(pose: Array, betas: Array, body: Body) -> Array:
         own &= vertices[:, 1] < vertices[own, 1].min() + 0.03
         soles.append(np.flatnonzero(own))
     n = min(len(sole) for sole in soles)
-    chosen = np.concatenate([sole[np.linspace(0, len(sole) - 1, n).astype(int)] for sole in soles])
-    points, weights = vertices[chosen], body.weights[chosen]
+    lowest = np.concatenate([sole[np.linspace(0, len(sole) - 1, n).astype(int)] for sole in soles])
+    points, weights = vertices[lowest], body.weights[lowest]
     posed = [lbs(points, weights, joint_transforms(frame, joints, body.parents)) for frame in pose]
     return np.stack(posed).reshape(len(pose), 2, n, 3)
 

@@ -149,9 +149,9 @@ def _poses(rng: np.random.Generator, betas: NDArray[np.float64], body: Body, cou
     else:
         show = motion.stroll(rng, length, reach=1.0)
     show = replace(show, yaw=show.yaw + rng.uniform(0, 2 * np.pi))
-    chosen = np.sort(rng.choice(length, count, replace=count > length))
+    picked = np.sort(rng.choice(length, count, replace=count > length))
     poses = motion.body_poses(show, betas, body)
-    return [poses[k] for k in chosen]
+    return [poses[k] for k in picked]
 
 
 def _camera(rng: np.random.Generator, pose: BodyPose, body: Body) -> Camera:
@@ -171,7 +171,7 @@ def phrases(style: outfit.Style) -> tuple[str, ...]:
     """The parts of the caption."""
     main, second, accent = (_name(colour, COLOURS) for colour in style.top_colours)
     sleeves = "short" if style.sleeve < 1 else "long"
-    found = [
+    parts = [
         f"{_name(style.skin, TONES)} skin",
         f"{_name(style.hair, COLOURS)} {style.hair_cut} hair",
         f"{main} {PATTERNS[style.top_pattern]} {style.top} with {second} and {accent}",
@@ -179,7 +179,7 @@ def phrases(style: outfit.Style) -> tuple[str, ...]:
         f"{'short' if style.leg < 1.5 else 'long'} {_name(style.bottom_colours[0], COLOURS)} {style.bottom}",
         f"{_name(style.shoe_colours[0], COLOURS)} shoes",
     ]
-    return (*found, "beard") if style.beard else tuple(found)
+    return (*parts, "beard") if style.beard else tuple(parts)
 
 
 def _name(colour: Colour, names: dict[str, Colour]) -> str:

@@ -235,8 +235,8 @@ def read_annots(path: Path) -> Annots:
     counts = {key: len(value) for key, value in cameras.items()}
     n_cameras = counts["K"]
     if len(set(counts.values())) != 1 or n_cameras == 0:
-        found = ", ".join(f"{n} {key}" for key, n in counts.items())
-        raise BadInput(f"{path}: expected as many K, D, R and T as cameras, found {found}")
+        counted = ", ".join(f"{n} {key}" for key, n in counts.items())
+        raise BadInput(f"{path}: expected as many K, D, R and T as cameras, found {counted}")
     _check_calibration(cameras, path)
     image_paths = _image_paths(content["ims"], n_cameras, path)
     camera_ids = tuple(PurePosixPath(image).parent.as_posix() for image in image_paths[0])
@@ -245,20 +245,20 @@ def read_annots(path: Path) -> Annots:
 
 def _camera_field(cams: dict, key: str, path: Path) -> NDArray[np.float64]:
     shape = CAMERA_SHAPES[key]
-    wanted = f"expected cams[{key!r}] to be one array of shape {list(shape)} for each camera"
+    expected = f"expected cams[{key!r}] to be one array of shape {list(shape)} for each camera"
     if key not in cams:
-        raise BadInput(f"{path}: {wanted}, found no such key")
+        raise BadInput(f"{path}: {expected}, found no such key")
     try:
         stacked = np.array([np.asarray(value, np.float64) for value in cams[key]])
     except (TypeError, ValueError):
-        raise BadInput(f"{path}: {wanted}, found {described(cams[key])} of other contents") from None
+        raise BadInput(f"{path}: {expected}, found {described(cams[key])} of other contents") from None
     flat_vector = len(shape) == 1 and stacked.ndim == 3 and 1 in stacked.shape[1:]
     if flat_vector:  # stored as a column or a row
         stacked = stacked.reshape(len(stacked), -1)
     if stacked.shape[1:] != shape:
-        raise BadInput(f"{path}: {wanted}, found {list(stacked.shape[1:])}")
+        raise BadInput(f"{path}: {expected}, found {list(stacked.shape[1:])}")
     if not np.isfinite(stacked).all():
-        raise BadInput(f"{path}: {wanted}, found NaN or infinity in it")
+        raise BadInput(f"{path}: {expected}, found NaN or infinity in it")
     return stacked
 
 
@@ -276,13 +276,13 @@ def _check_calibration(cameras: dict[str, NDArray[np.float64]], path: Path) -> N
 
 
 def _image_paths(ims: Any, n_cameras: int, path: Path) -> list[tuple[str, ...]]:
-    wanted = "expected 'ims' to be one {'ims': [image paths]} for each frame"
+    expected = "expected 'ims' to be one {'ims': [image paths]} for each frame"
     try:
         frames = [tuple(str(image) for image in frame["ims"]) for frame in ims]
     except (TypeError, KeyError, IndexError):
-        raise BadInput(f"{path}: {wanted}, found {described(ims)} of other contents") from None
+        raise BadInput(f"{path}: {expected}, found {described(ims)} of other contents") from None
     if not frames:
-        raise BadInput(f"{path}: {wanted}, found no frame")
+        raise BadInput(f"{path}: {expected}, found no frame")
     for index, frame in enumerate(frames):
         if len(frame) != n_cameras:
             raise BadInput(

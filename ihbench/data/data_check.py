@@ -29,8 +29,8 @@ BODY_LINE, MASK_LINE = (0, 220, 255), (255, 60, 60)  # RGB: the projected body, 
 
 def protocols_of(dataset: str) -> list[Protocol]:
     """The registered protocols on a data set, at the profile that reads most."""
-    found = (load_protocol(name, "paper") for name in registry.names("protocol"))
-    return [protocol for protocol in found if protocol.dataset == dataset]
+    protocols = (load_protocol(name, "paper") for name in registry.names("protocol"))
+    return [protocol for protocol in protocols if protocol.dataset == dataset]
 
 
 def fitness(capture: Capture, protocol: Protocol) -> str:
@@ -56,9 +56,9 @@ def overlay(capture: Capture, body: Body, source: str) -> NDArray[np.uint8] | No
     Beginning, middle and end of what the first camera has. `source` names the masks.
     """
     frames = [frame for frame in range(capture.n_frames) if not capture.lacks(0, frame, source)]
-    chosen = sorted({frames[int(k)] for k in np.linspace(0, len(frames) - 1, OVERLAY_FRAMES)}) if frames else []
+    sampled = sorted({frames[int(k)] for k in np.linspace(0, len(frames) - 1, OVERLAY_FRAMES)}) if frames else []
     panels = []
-    for frame in chosen:
+    for frame in sampled:
         try:
             image, mask = capture.image(0, frame), capture.silhouette(0, frame, source)
             panels.append(_outlined(image, mask, body, capture.body_pose(frame), capture.camera(0)))
