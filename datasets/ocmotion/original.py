@@ -245,16 +245,6 @@ class OcMotionCapture(OneCameraCapture):
             where,
         )
 
-    def bbox(self, frame: int) -> Array:
-        """[2, 2] px: corners (x1, y1), (x2, y2) as stored."""
-        person, where = self._at(frame)
-        return numbers(person, "bbox", (2, 2), where)
-
-    def joints_2d(self, frame: int) -> Array:
-        """[n, 2 or more] px: `lsp_joints_2d` as stored, x and y first."""
-        person, where = self._at(frame)
-        return numbers(person, "lsp_joints_2d", (-1, -1), where)
-
     def _at(self, frame: int) -> tuple[Mapping, str]:
         self.check_index(0, frame)
         return self._people[frame]

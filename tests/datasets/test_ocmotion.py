@@ -192,22 +192,6 @@ def assert_same_pose(read: BodyPose, written: BodyPose, tolerance: float = 1e-12
 # ------------------------------------------------------------------------------------ w2a: what is read
 
 
-def test_w2a_reading_gives_back_what_was_written(w2a, smpl):
-    capture = OcMotionW2a(w2a.root).open(NAME, smpl)
-    assert (capture.name, capture.dataset, capture.variant) == (NAME, "ocmotion", "w2a")
-    assert (capture.standin, capture.body, capture.n_frames) == ("", "smpl", N_FRAMES)
-    assert (capture.camera_ids, capture.frame_names) == (("02",), tuple(NAMES))
-    assert_same_camera(capture.camera(0), w2a.cameras[OWN])
-    for frame in range(N_FRAMES):
-        np.testing.assert_array_equal(capture.image(0, frame), w2a.images[frame])
-        for source in ("visible", "mask"):
-            np.testing.assert_array_equal(capture.silhouette(0, frame, source), w2a.masks[frame])
-        read = capture.body_pose(frame)
-        np.testing.assert_array_equal(read.pose[1:], w2a.poses[frame].pose[1:])
-        assert_same_pose(read, w2a.poses[frame], 1e-7)  # the root is float32 in mesh_infos.pkl
-        np.testing.assert_allclose(capture.vertices(frame), smpl.pose(w2a.poses[frame]), atol=1e-6)
-
-
 def test_w2a_poses_are_exact_without_mesh_infos(sequence, w2a):
     (sequence / "mesh_infos.pkl").unlink()
     for frame, pose in enumerate(w2a.poses):
@@ -610,33 +594,7 @@ def test_symlink_loops_do_no_harm(sequence, release):
     assert time.perf_counter() - start < 5
 
 
-# ------------------------------------------------------------------------------------------------ check
-
-
-def test_check_notices_poses_of_other_frames(sequence, w2a, smpl):
-    moved = [dataclasses.replace(pose, transl=pose.transl - np.array([0.5, 0, 0])) for pose in w2a.poses]
-    ocmotion_w2a.write_sequence_metadata(sequence, NAMES, w2a.cameras[OWN], moved)
-    (subject,) = OcMotionW2a.check(sequence.parent, smpl).subjects
-    assert subject.mask_on_body < 0.9
-    assert len(subject.problems) == 1
-
-
 # --------------------------------------------------------------------------------- the original release
-
-
-def test_original_reading_gives_back_what_was_written(original, smpl):
-    capture = OcMotionOriginal(original.root).open("0011_02", smpl)
-    assert (capture.name, capture.dataset, capture.variant) == ("0011_02", "ocmotion", "original")
-    assert (capture.standin, capture.body, capture.n_frames) == ("", "smpl", N_FRAMES)
-    assert (capture.camera_ids, capture.frame_names[0]) == (("02",), "00001")
-    assert_same_camera(capture.camera(0), original.cameras[OWN])
-    for frame in range(N_FRAMES):
-        assert_same_pose(capture.body_pose(frame), original.poses[frame], 0)
-        np.testing.assert_array_equal(capture.vertices(frame), smpl.pose(original.poses[frame]))
-        assert np.abs(capture.image(0, frame).astype(int) - original.images[frame]).mean() < 2
-        np.testing.assert_array_equal(capture.silhouette(0, frame, "visible"), original.masks[frame])
-        np.testing.assert_array_equal(capture.bbox(frame), [[10, 20], [30 + frame, 40]])
-        np.testing.assert_array_equal(capture.joints_2d(frame), np.full((14, 3), 5.0 + frame))
 
 
 def test_stored_annotations_are_as_chomp_reads_them(original, smpl):

@@ -318,19 +318,6 @@ def test_several_scenes_are_named_by_folder_or_file(tmp_path, own_body):
         PlainScene(tmp_path)
 
 
-def test_other_folders_are_bad_input(tmp_path, written):
-    with pytest.raises(BadInput, match="no such folder"):
-        PlainScene(tmp_path / "nowhere")
-    with pytest.raises(BadInput, match=r"expected a scene \(cameras\.json") as error:
-        PlainScene(tmp_path)
-    message(error)
-    shutil.copytree(written[0], tmp_path / "deep/deeper/dance")
-    with pytest.raises(BadInput, match=r"there is one in .*deeper, give that folder"):
-        PlainScene(tmp_path / "deep")
-    with pytest.raises(BadInput):
-        PlainScene.check(tmp_path / "nowhere")
-
-
 # ------------------------------------------------------------------------------------------- bad files
 
 
@@ -658,26 +645,6 @@ def each_mask(folder, change):
         Image.fromarray(change(np.array(Image.open(path)))).save(path)
 
 
-@pytest.mark.parametrize(
-    ("change", "text"),
-    [
-        (lambda mask: 255 - mask, "the masks look inverted"),
-        (lambda mask: mask[:, ::-1].copy(), "mirrored left to right"),
-        (lambda mask: mask[::-1].copy(), "upside down"),
-        (lambda mask: mask[::-1, ::-1].copy(), "turned by 180°"),
-        (lambda mask: np.full_like(mask, 255), "cover whole pictures"),
-        (lambda mask: np.roll(mask, 25, 1), "of the body's vertices project into the silhouettes"),
-        (lambda mask: np.zeros_like(mask), "show no person"),
-    ],
-)
-def test_check_names_wrong_masks(change, text, copy):
-    each_mask(copy, change)
-    problems = problems_of(copy)
-    assert problems
-    assert all(text in problem for problem in problems)
-    assert len(problems) == 1
-
-
 def test_check_accepts_an_occluded_person(copy):
     def cut(mask):
         mask[HEIGHT // 2 :] = 0
@@ -685,39 +652,6 @@ def test_check_accepts_an_occluded_person(copy):
 
     each_mask(copy, cut)
     assert problems_of(copy) == []
-
-
-def rewrite(folder, body, cameras=None, poses=None):
-    if cameras:
-        plain_scene.write_cameras(folder, cameras)
-    if poses:
-        plain_scene.write_poses(folder, poses, FRAMES)
-
-
-def test_check_names_wrong_units(copy, own_body):
-    cameras, poses = make_cameras(), make_poses(own_body)
-    for factor, text in ((1000, "look like millimetres"), (1e-3, "not in metres")):
-        rewrite(copy, own_body, {n: dataclasses.replace(c, t=factor * c.t) for n, c in cameras.items()}, poses)
-        (problem,) = problems_of(copy)
-        assert "cameras left, right" in problem
-        assert text in problem
-    scaled = [BodyPose(pose.pose, pose.betas, 1000 * (pose.transl + 1)) for pose in poses]
-    rewrite(copy, own_body, cameras, scaled)
-    assert "look like millimetres" in problems_of(copy)[0]
-
-
-def test_check_names_cameras_that_see_no_body(copy, own_body):
-    cameras = make_cameras()
-    turned = dataclasses.replace(cameras["right"], R=np.diag([-1.0, 1, -1]) @ cameras["right"].R)
-    turned = dataclasses.replace(turned, t=np.diag([-1.0, 1, -1]) @ turned.t)
-    rewrite(copy, own_body, cameras | {"right": turned})
-    (problem,) = problems_of(copy)
-    assert "camera right: sees no body" in problem
-    assert "behind it" in problem
-    moved = dataclasses.replace(cameras["right"], t=cameras["right"].t + np.array([9, 0, 0]))
-    rewrite(copy, own_body, cameras | {"right": moved})
-    (problem,) = problems_of(copy)
-    assert "out of the picture" in problem
 
 
 def test_check_of_a_scene_that_cannot_be_opened(copy):
