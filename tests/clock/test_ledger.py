@@ -452,3 +452,13 @@ def test_a_lent_state_brings_no_events_of_its_lender(tmp_path):
     borrower = Ledger(tmp_path / "borrower")
     assert borrower.load_state("stage1") is not None
     assert borrower.events == []
+
+
+def test_an_artifact_lies_beside_the_record_under_a_known_name_only(tmp_path):
+    ledger = Ledger(tmp_path)
+    ledger.artifact("inpainting.png", b"picture")
+    assert (tmp_path / "inpainting.png").read_bytes() == b"picture"
+    for name in ("run.json", "../inpainting.png"):
+        with pytest.raises(ValueError, match="artifact: expected one of inpainting.png"):
+            ledger.artifact(name, b"")
+    assert (Ledger().artifact("inpainting.png", b"x"), Ledger().on_disk) == (None, False)  # nowhere to put it
