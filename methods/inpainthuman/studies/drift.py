@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,13 +124,23 @@ def flicker(
     return Flicker(n, deviation, change, n_seen, deviation_floor, change_floor, reason)
 
 
+class HiddenScores(TypedDict):
+    """Of one region: means over all of its pixels, over the views that hide something, and view by view."""
+
+    pixels: int
+    pooled: dict[str, float]  # psnr, ssim, flip
+    mean: dict[str, float]
+    views: list[dict[str, float]]  # view, pixels, psnr, ssim, flip
+    reason: str  # why numbers are absent
+
+
 def hidden_scores(
     completed: Sequence[Image],
     truths: Sequence[Image],  # the un-occluded crops
     views: Sequence[CropView],
     truth_silhouettes: Sequence[NDArray[np.bool_]],  # [S, W] complete
     background: tuple[float, float, float] = (1.0, 1.0, 1.0),  # RGB in [0, 1], of the metrics' painting
-) -> dict[str, Any]:
+) -> dict[str, HiddenScores]:
     """Scores of the hidden person: unknown pixels inside the true silhouette, and of those on the posed body model
     alone (`on_body`), where a painter that takes the model for the silhouette is judged by its colours.
 
@@ -247,7 +257,7 @@ def _scores(
     masks: Sequence[NDArray[np.bool_]],
     numbers: Sequence[int],
     background: tuple[float, float, float],
-) -> dict[str, Any]:
+) -> HiddenScores:
     rows, error, pixels = [], 0.0, 0
     for painted, truth, mask, number in zip(completed, truths, masks, numbers, strict=True):
         n = int(mask.sum())
