@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ihbench.fit.dissimilarity import dissimilarity, where_known
+from ihbench.fit.losses import dissimilarity, where_known
 from ihbench.methods.inpainthuman.inpainting.painted_view import PaintedView
 from ihbench.methods.inpainthuman.refine_config import RefineConfig
 from ihbench.scene.contracts import MaskState

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ihbench.camera import Camera
 from ihbench.clock.ledger import Ledger
-from ihbench.fit.dissimilarity import dissimilarity, where_known
+from ihbench.fit.losses import dissimilarity, where_known
 from ihbench.methods.inpainthuman.avatar.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.config import ONE_FIT_SSIM
 from ihbench.methods.inpainthuman.spec import STAGE1
