@@ -1,6 +1,4 @@
-"""What stages 1 and 3 share: AdamW on the avatar, step by step, stopped after any step and gone on with later.
-
-With `maps_only` the UV feature maps alone are optimised; the decoder and the residual's encoder stay as they are.
+"""Fitting an avatar with AdamW, one view a step, stopped after any step and gone on with later.
 
 The guard has three parts. Gradients are clipped. A step whose loss or gradient is not finite, or whose loss has
 exploded, is rejected: the fit goes back to the last good state and on with smaller step sizes, a bounded number of
@@ -11,27 +9,38 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Generic, TypeVar
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ihbench.clock.checkpoints import Tensors, Words
 from ihbench.clock.events import Resumed, RolledBack
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput, Diverged
-from ihbench.methods.inpainthuman.avatar.avatar import GaussianAvatar
 from ihbench.scene.contracts import MaskState, TrainingSet
 
 GOOD_EVERY = 25  # steps between two copies to go back to
 SMALLER = 0.1  # share that is left of the step sizes after going back
 MOST_ROLL_BACKS = 3  # of a stage
 EXPLODED = 10.0  # times what any view cost at first, and what this one costs with the last good parameters
+
+
+Module = TypeVar("Module", bound=nn.Module)
+
+
+@dataclass(frozen=True)
+class ParameterGroup:
+    """Parameters that share AdamW's settings."""
+
+    parameters: Sequence[nn.Parameter]
+    lr: float
+    weight_decay: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -42,13 +51,14 @@ class _Good:
     tensors: dict[str, Tensor]
 
 
-class Optimisation(ABC):
+class Optimisation(ABC, Generic[Module]):
     """One view a step. A stage gives its loss (`_loss`), and may act before each step (`_before_step`) and after a
     saved state has been restored (`_restored`).
 
-    `steps` are the stage's own. `first_step` is how many the avatar had before, so that steps offered to the ledger
-    and named in a divergence grow over all stages. `lr_share` scales the configured step sizes, which rise over the
-    share `warm_up` of the steps.
+    Parameters of the avatar in none of the `groups` are frozen meanwhile. Step sizes rise over the share `warm_up` of
+    the steps and fall to the share `lr_final` as half a cosine; each group's gradient is clipped to the norm
+    `clip_gradient`. `steps` are the stage's own. `first_step` is how many the avatar had before: steps offered to
+    the ledger and named in a divergence grow over all stages.
     """
 
     name: str  # of the saved state
@@ -56,32 +66,28 @@ class Optimisation(ABC):
 
     def __init__(
         self,
-        avatar: GaussianAvatar,
+        avatar: Module,
         training: TrainingSet,
         seed: int,
         ledger: Ledger,
+        groups: Sequence[ParameterGroup],
         *,
         steps: int,
         views: int,
+        lr_final: float,
+        clip_gradient: float,
         first_step: int = 0,
-        lr_share: float = 1.0,
         warm_up: float = 0.0,
-        maps_only: bool = False,
     ):
         self.avatar, self.training, self.seed, self.ledger = avatar, training, seed, ledger
         self.steps, self.views, self.first_step, self.warm_up = steps, views, first_step, warm_up
-        config = avatar.config
-        networks = [(avatar.decoder, config.lr_decoder)]
-        if config.pose_residual:
-            networks.append((avatar.encoder, config.lr_encoder))
-        self._resting = [network for network, _ in networks] if maps_only else []
-        groups: list[dict[str, Any]] = [
-            {"params": list(avatar.features.parameters()), "lr": config.lr_maps * lr_share, "weight_decay": 0.0}
-        ]
-        for network, rate in networks if not maps_only else []:
-            groups.append({"params": list(network.parameters()), "lr": rate * lr_share, "weight_decay": 0.01})
-        self.rates = [group["lr"] for group in groups]
-        self.optimizer = torch.optim.AdamW(groups, fused=True)
+        self.lr_final, self.clip_gradient = lr_final, clip_gradient
+        optimised = {id(p) for group in groups for p in group.parameters}
+        self._frozen = [p for p in avatar.parameters() if id(p) not in optimised]
+        self.rates = [group.lr for group in groups]
+        self.optimizer = torch.optim.AdamW(
+            [{"params": list(g.parameters), "lr": g.lr, "weight_decay": g.weight_decay} for g in groups], fused=True
+        )
         self.names = {id(p): name for name, p in avatar.named_parameters()}
         self.step = 0
         self.rolled_back = 0  # times
@@ -93,10 +99,10 @@ class Optimisation(ABC):
     def _loss(self, k: int) -> Tensor:
         """The loss of view k. Must be differentiable in the avatar's parameters."""
 
-    def _before_step(self) -> None:  # noqa: B027
+    def _before_step(self) -> None:
         """Called before each step; `self.step` are done."""
 
-    def _restored(self) -> None:  # noqa: B027
+    def _restored(self) -> None:
         """Called when a saved state has been restored; `self.step` are done."""
 
     def run(self, progress: Progress) -> None:
@@ -108,7 +114,7 @@ class Optimisation(ABC):
         self._require_visible_pixels()
         self._restore()
         started_at = self.step
-        with progress.task(self.title, self.steps) as task, self._networks_at_rest():
+        with progress.task(self.title, self.steps) as task, self._freezing():
             task.advance(self.step)
             while True:
                 try:
@@ -131,15 +137,15 @@ class Optimisation(ABC):
         self.save()
 
     @contextmanager
-    def _networks_at_rest(self) -> Iterator[None]:
+    def _freezing(self) -> Iterator[None]:
         """Without gradients of what is not optimised."""
-        for network in self._resting:
-            network.requires_grad_(False)
+        for p in self._frozen:
+            p.requires_grad_(False)
         try:
             yield
         finally:
-            for network in self._resting:
-                network.requires_grad_(True)
+            for p in self._frozen:
+                p.requires_grad_(True)
 
     def _require_visible_pixels(self) -> None:
         shows = any((view.mask == MaskState.PERSON).any() for view in self.training.views)
@@ -154,11 +160,10 @@ class Optimisation(ABC):
         return int(np.random.default_rng((self.seed, epoch)).permutation(n)[k])
 
     def _one_step(self, k: int) -> None:
-        config = self.avatar.config
         self._before_step()
         share = self.step / self.steps
         rise = min((self.step + 1) / max(self.warm_up * self.steps, 1), 1)
-        decay = config.lr_final + (1 - config.lr_final) * 0.5 * (1 + math.cos(math.pi * share))
+        decay = self.lr_final + (1 - self.lr_final) * 0.5 * (1 + math.cos(math.pi * share))
         for group, rate in zip(self.optimizer.param_groups, self.rates, strict=True):
             group["lr"] = rate * decay * rise * SMALLER**self.rolled_back
         self.optimizer.zero_grad(set_to_none=True)
@@ -166,7 +171,7 @@ class Optimisation(ABC):
         self._check_loss(k, loss.item())
         loss.backward()
         for group in self.optimizer.param_groups:
-            norm = torch.nn.utils.clip_grad_norm_(group["params"], config.clip_gradient)
+            norm = torch.nn.utils.clip_grad_norm_(group["params"], self.clip_gradient)
             if not math.isfinite(norm.item()):
                 raise Diverged(self.first_step + self.step, f"gradient norm is {norm.item()}")
         if self.step % GOOD_EVERY == 0:
@@ -281,7 +286,7 @@ class Optimisation(ABC):
             self._first_bad = Diverged(*meta["first_bad"])
         if "good" in meta:
             named = {name.removeprefix("good."): v for name, v in tensors.items() if name.startswith("good.")}
-            device = self.avatar.device
+            device = next(self.avatar.parameters()).device
             self._good = _Good(meta["good"], {n: torch.as_tensor(v).to(device) for n, v in named.items()})
         self._restored()
         self.ledger.event(Resumed(self.name, self.step))

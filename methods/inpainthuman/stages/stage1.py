@@ -14,7 +14,7 @@ from ihbench.fit.losses import dissimilarity, where_known
 from ihbench.methods.inpainthuman.avatar.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.config import ONE_FIT_SSIM
 from ihbench.methods.inpainthuman.spec import STAGE1
-from ihbench.methods.inpainthuman.stages.optimisation import Optimisation
+from ihbench.methods.inpainthuman.stages.optimisation import Optimisation, ParameterGroup
 from ihbench.render.splat import render_gaussians
 from ihbench.scene.contracts import MaskState, TrainingSet, TrainView
 from ihbench.scene.views import LazyViews
@@ -129,14 +129,37 @@ def loss_of(avatar: GaussianAvatar, target: Target, background: tuple[float, flo
     return loss + ONE_FIT_SSIM * dissimilarity(*where_known(drawn.rgb, target.image, unknown), target.person)
 
 
-class Stage1(Optimisation):
+def parameter_groups(avatar: GaussianAvatar, lr_share: float = 1.0, maps_only: bool = False) -> list[ParameterGroup]:
+    """With the configured step sizes times `lr_share`; with `maps_only` the UV feature maps alone."""
+    config = avatar.config
+    groups = [ParameterGroup(list(avatar.features.parameters()), config.lr_maps * lr_share)]
+    networks = [] if maps_only else [(avatar.decoder, config.lr_decoder)]
+    if config.pose_residual and not maps_only:
+        networks.append((avatar.encoder, config.lr_encoder))
+    return groups + [
+        ParameterGroup(list(network.parameters()), lr * lr_share, weight_decay=0.01) for network, lr in networks
+    ]
+
+
+class Stage1(Optimisation[GaussianAvatar]):
     """The optimisation, step by step, with everything needed to stop after any step and go on later."""
 
     name, title = STAGE1, "stage 1"
 
     def __init__(self, avatar: GaussianAvatar, training: TrainingSet, seed: int, ledger: Ledger):
         views = training.views
-        super().__init__(avatar, training, seed, ledger, steps=avatar.config.fit_steps, views=len(views))
+        config = avatar.config
+        super().__init__(
+            avatar,
+            training,
+            seed,
+            ledger,
+            parameter_groups(avatar),
+            steps=config.fit_steps,
+            views=len(views),
+            lr_final=config.lr_final,
+            clip_gradient=config.clip_gradient,
+        )
         self._targets = LazyViews(lambda k: prepare_target(avatar, views[k]), len(views), held=TARGETS_HELD)
 
     def _loss(self, k: int) -> Tensor:

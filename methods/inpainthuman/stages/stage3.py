@@ -29,6 +29,7 @@ from ihbench.methods.inpainthuman.stages.stage1 import (
     draw,
     fitted_window,
     initial_loss,
+    parameter_groups,
     prepare_target,
 )
 from ihbench.scene.contracts import MaskState, TrainingSet, TrainView
@@ -45,7 +46,7 @@ class RefineTarget:
     painted: PaintedTarget
 
 
-class Stage3(Optimisation):
+class Stage3(Optimisation[GaussianAvatar]):
     """Each step draws one view and adds the refinement loss to stage 1's, which keeps the visible pixels.
 
     `painted` are training views by their index, at most one each, and views that were never taken, by any index
@@ -77,12 +78,13 @@ class Stage3(Optimisation):
             training,
             seed,
             ledger,
+            parameter_groups(avatar, chosen.lr_share, maps_only=not chosen.networks),
             steps=chosen.steps,
             views=n + len(self._others),
             first_step=avatar.config.fit_steps,
-            lr_share=chosen.lr_share,
+            lr_final=avatar.config.lr_final,
+            clip_gradient=avatar.config.clip_gradient,
             warm_up=chosen.warm_up,
-            maps_only=not chosen.networks,
         )
         self._targets = LazyViews(self._target, self.views, held=TARGETS_HELD)
         self._perceptual: Perceptual | None = None
