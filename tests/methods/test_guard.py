@@ -12,7 +12,7 @@ from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import Diverged
-from ihbench.methods.inpainthuman.stages.optimisation import GOOD_EVERY, MOST_ROLL_BACKS, SMALLER
+from ihbench.fit.optimisation import GOOD_EVERY, MOST_ROLL_BACKS, SMALLER
 from ihbench.methods.inpainthuman.stages.stage1 import Stage1, loss_of, prepare_target
 from ihbench.scene.contracts import MaskState
 
@@ -59,7 +59,7 @@ def test_a_fit_in_which_nothing_is_wrong_is_the_fit_without_a_guard(training, mo
     assert events(ledger) == []
     for name in ("_check_loss", "_check_end"):
         monkeypatch.setattr(Stage1, name, lambda self, *_: None)
-    monkeypatch.setattr("ihbench.methods.inpainthuman.stages.optimisation.GOOD_EVERY", 10**9)
+    monkeypatch.setattr("ihbench.fit.optimisation.GOOD_EVERY", 10**9)
     assert equal_bits(guarded, parameters_of(fitted(training, **SMALL)))
 
 

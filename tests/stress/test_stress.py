@@ -121,8 +121,8 @@ def test_dropping_the_alpha_clamp_fails_a_named_case(cases, monkeypatch):
         ("ihbench.render.splat_numba", "T_STOP", 0.5, "splat-stack-thin"),
         ("ihbench.metrics.ssim", "K1", 0.02, "ssim-constant-uint8"),
         ("ihbench.render.zbuffer", "NEAR", -1.0, "triangle-behind-near"),
-        ("ihbench.methods.inpainthuman.stages.optimisation", "MOST_ROLL_BACKS", 0, "inpainthuman-nan-loss-once"),
-        ("ihbench.methods.inpainthuman.stages.optimisation", "EXPLODED", math.inf, "inpainthuman-rate-1000"),
+        ("ihbench.fit.optimisation", "MOST_ROLL_BACKS", 0, "inpainthuman-nan-loss-once"),
+        ("ihbench.fit.optimisation", "EXPLODED", math.inf, "inpainthuman-rate-1000"),
     ],
 )
 def test_a_changed_constant_fails_a_named_case(cases, monkeypatch, module, name, value, case):

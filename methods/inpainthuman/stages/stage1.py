@@ -11,10 +11,10 @@ from torch import Tensor
 from ihbench.camera import Camera
 from ihbench.clock.ledger import Ledger
 from ihbench.fit.losses import dissimilarity, where_known
+from ihbench.fit.optimisation import Optimisation, ParameterGroup
 from ihbench.methods.inpainthuman.avatar.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.config import ONE_FIT_SSIM
 from ihbench.methods.inpainthuman.spec import STAGE1
-from ihbench.methods.inpainthuman.stages.optimisation import Optimisation, ParameterGroup
 from ihbench.render.splat import render_gaussians
 from ihbench.scene.contracts import MaskState, TrainingSet, TrainView
 from ihbench.scene.views import LazyViews

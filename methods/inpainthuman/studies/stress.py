@@ -18,10 +18,10 @@ from ihbench.camera import Camera
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
+from ihbench.fit.optimisation import MOST_ROLL_BACKS
 from ihbench.methods.inpainthuman.avatar.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.config import QUICK, InpaintHumanConfig
 from ihbench.methods.inpainthuman.method import InpaintHuman
-from ihbench.methods.inpainthuman.stages.optimisation import MOST_ROLL_BACKS
 from ihbench.methods.inpainthuman.stages.stage1 import Stage1, loss_of, prepare_target
 from ihbench.scene.contracts import MaskState, TrainingSet, TrainView
 from ihbench.stress.case import Answer, Case, Unit, words_of
