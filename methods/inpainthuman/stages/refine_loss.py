@@ -6,21 +6,16 @@ loss of the original view stands beside it, from the same rendering.
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
-from ihbench.fit.losses import dissimilarity, where_known
+from ihbench.fit.losses import Perceptual, dissimilarity, masked_mean, perceptual, where_known
 from ihbench.methods.inpainthuman.inpainting.painted_view import PaintedView
 from ihbench.methods.inpainthuman.refine_config import RefineConfig
 from ihbench.scene.contracts import MaskState
-
-Perceptual = Callable[[Tensor, Tensor], Tensor]  # two images [h, w, 3] in [0, 1] -> a distance
 
 
 @dataclass(frozen=True)
@@ -67,7 +62,7 @@ def refine_loss(
     rgb: Tensor,  # [h, w, 3] what the avatar shows
     target: PaintedTarget,
     config: RefineConfig,
-    perceptual: Perceptual | None = None,
+    distance: Perceptual | None = None,
 ) -> Tensor:
     """L1 + SSIM + LPIPS over M_full, plus L1 to the background where the complete mask has cleared a hidden pixel.
 
@@ -76,36 +71,20 @@ def refine_loss(
     """
     total = target.weight.sum().clamp(min=1)
     error = (rgb - target.image).abs()
-    loss = (error * target.weight).sum() / (3 * total)
+    loss = masked_mean(error, target.weight)
     if config.background > 0:
         loss = loss + config.background * (error * target.cleared).sum() / (3 * total)
-    if config.ssim > 0 or perceptual is not None:
+    if config.ssim > 0 or distance is not None:
         seen, wanted = where_known(rgb, target.image, target.unknown)
         if config.ssim > 0:
             loss = loss + config.ssim * dissimilarity(seen, wanted, target.weight)
-        if perceptual is not None:
+        if distance is not None:
             inside = target.weight > 0
             pair = (torch.where(inside, image, target.off) for image in (seen, wanted))
-            loss = loss + config.lpips * perceptual(*pair)
+            loss = loss + config.lpips * distance(*pair)
     return loss
 
 
 def load_perceptual(config: RefineConfig, device: torch.device) -> Perceptual | str | None:
     """LPIPS as a differentiable loss; the reason when its weights are not here; None when its weight is 0."""
-    if config.lpips == 0 or config.weight == 0:
-        return None
-    from ihbench.metrics.lpips import MIN_SIDE, PADDING, load
-
-    network = load(config.lpips_net)
-    if isinstance(network, str):
-        return network
-    # the metric's own network stays as it is, on the CPU
-    package = copy.deepcopy(network.package).to(device).requires_grad_(False)
-
-    def distance(pred: Tensor, truth: Tensor) -> Tensor:
-        height, width = pred.shape[:2]
-        pad = (0, max(MIN_SIDE - width, 0), 0, max(MIN_SIDE - height, 0))
-        x, y = (F.pad(image.permute(2, 0, 1)[None], pad, value=PADDING) for image in (pred, truth))
-        return package(2 * x - 1, 2 * y - 1).sum()
-
-    return distance
+    return None if config.lpips == 0 or config.weight == 0 else perceptual(config.lpips_net, device)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ihbench.camera import Camera
 from ihbench.clock.ledger import Ledger
-from ihbench.fit.losses import dissimilarity, where_known
+from ihbench.fit.losses import dissimilarity, masked_mean, where_known
 from ihbench.fit.optimisation import Optimisation, ParameterGroup
 from ihbench.methods.inpainthuman.avatar.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.config import ONE_FIT_SSIM
@@ -106,7 +106,7 @@ def initial_loss(avatar: GaussianAvatar, drawn: Drawn, target: Target) -> Tensor
     config = avatar.config
     error = (drawn.rgb - target.image).abs()
     visible = target.person.sum().clamp(min=1) * 3
-    loss = (error * target.person).sum() / visible
+    loss = masked_mean(error, target.person)
     if config.paper_strict:
         return loss
     loss = loss + config.background_weight * (error * target.background).sum() / visible

@@ -12,13 +12,13 @@ from ihbench.clock.events import LeftOut
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
+from ihbench.fit.losses import Perceptual
 from ihbench.fit.optimisation import Optimisation
 from ihbench.methods.inpainthuman.avatar.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.inpainting.painted_view import PaintedView
 from ihbench.methods.inpainthuman.refine_config import RefineConfig
 from ihbench.methods.inpainthuman.stages.refine_loss import (
     PaintedTarget,
-    Perceptual,
     load_perceptual,
     prepare_painted,
     refine_loss,
