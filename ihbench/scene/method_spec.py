@@ -50,7 +50,7 @@ class MethodSpec:
     """A method, without importing it. Only the first five must be given."""
 
     name: str  # as on the command line; the entry point has the same
-    title: str  # as tables print it
+    title: str  # as its paper writes it
     summary: str  # one line, for `ihbench list`
     method: str  # "package.module:Class", a `scene.contracts.Method`
     profiles: Profiles  # "quick" and "paper" -> configuration; its fields become --method.* switches
