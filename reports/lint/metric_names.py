@@ -39,11 +39,6 @@ class HeadMetric:
     arrow: str  # "↑", "↓" or ""
     scaled: bool  # a star, × 1000 or % stands beside the name
     unit: str  # "dB"
-    rest: str  # what stands before the name: the data set, in a head of one line
-
-    @property
-    def known(self) -> bool:
-        return self.name in QUALITY or self.name in COST
 
     @property
     def cost(self) -> bool:
@@ -73,5 +68,4 @@ def head_metric(text: str) -> HeadMetric | None:
         arrow="" if arrow is None else UP if arrow[0] in UPWARD else DOWN,
         scaled=bool(STAR.match(after) or SCALE.search(after)),
         unit=unit[1].lower() if unit else "",
-        rest=" ".join(text[: name.start()].split()).strip(" ,:/-") if name else "",
     )

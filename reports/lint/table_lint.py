@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
 
@@ -36,21 +36,18 @@ class Finding:
         return f"{self.line}: {self.cell}: {self.what}; expected {self.expected}"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Entry:
-    """A ranked number in a column."""
+    """A ranked number in a column; equal to itself only."""
 
     label: str
     cell: ReadCell
     number: Number
-    sections: tuple[int, int]  # by rules, by titles
+    section: int
 
     @property
     def value(self) -> float:
         return self.number.value
-
-
-Section = Callable[[_Entry], int]  # the section a number is ranked in
 
 
 @dataclass(frozen=True)
@@ -92,24 +89,20 @@ def _lint(table: ReadTable) -> Iterator[Finding]:
         yield from _decimals(fitting)
         checked.append(fitting)
     yield from _same_metric(checked)
-    readings = [list(_marks(checked, section, table.paired)) for section in _readings(checked)]
-    yield from min(readings, key=len)  # the first of equals: the whole column
+    whole = list(_marks(checked, table.paired, apart=False))
+    apart = list(_marks(checked, table.paired, apart=True)) if _has_sections(checked) else whole
+    yield from min(whole, apart, key=len)  # the first of equals: the whole column
 
 
-def _readings(columns: Sequence[_Column]) -> Iterator[Section]:
-    """How rows may be meant to be ranked: all together; or in sections, if there are some of two rows or more, and
-    every one has a best number marked somewhere."""
-    sections: tuple[Section, ...] = (lambda entry: entry.sections[1], lambda entry: entry.sections[0])
-    yield lambda entry: 0
-    for section in sections:
-        rows: dict[int, set[int]] = {}
-        marked: set[int] = set()
-        for column in columns:
-            for entry in column.entries:
-                rows.setdefault(section(entry), set()).add(entry.cell.line)
-                marked |= {section(entry)} if entry.cell.mark == "best" else set()
-        if len(rows) > 1 and all(len(lines) > 1 for lines in rows.values()) and marked == set(rows):
-            yield section
+def _has_sections(columns: Sequence[_Column]) -> bool:
+    """Whether rows may be meant to be ranked in sections: there are some of two rows or more, and every one has a
+    best number marked somewhere."""
+    entries = [entry for column in columns for entry in column.entries]
+    rows: dict[int, set[int]] = {}
+    for entry in entries:
+        rows.setdefault(entry.section, set()).add(entry.cell.line)
+    marked = {entry.section for entry in entries if entry.cell.mark == "best"}
+    return len(rows) > 1 and all(len(lines) > 1 for lines in rows.values()) and marked == set(rows)
 
 
 def _columns(table: ReadTable) -> list[_Column]:
@@ -118,7 +111,7 @@ def _columns(table: ReadTable) -> list[_Column]:
         if head.metric is None:
             continue
         entries = tuple(
-            _Entry(row.label, row.cells[k], number, (row.ruled_section, row.titled_section))
+            _Entry(row.label, row.cells[k], number, row.section)
             for row in table.rows
             if row.ranked and (number := row.cells[k].number) is not None
         )
@@ -220,13 +213,11 @@ def _same_metric(columns: Sequence[_Column]) -> Iterator[Finding]:
 # --------------------------------------------------------------------------------------------------------- marks
 
 
-def _marks(columns: Sequence[_Column], section: Section, paired: bool) -> Iterator[Finding]:
+def _marks(columns: Sequence[_Column], paired: bool, apart: bool) -> Iterator[Finding]:
     used = {entry.cell.mark for column in columns for entry in column.entries}
     for column in columns:
-        parts: dict[int, list[_Entry]] = {}
-        for entry in column.entries:
-            parts.setdefault(section(entry), []).append(entry)
-        for entries in parts.values():
+        for section in sorted({entry.section for entry in column.entries}) if apart else [None]:
+            entries = [entry for entry in column.entries if section in (None, entry.section)]
             yield from _marks_of(column, entries, used, paired)
 
 
@@ -242,10 +233,10 @@ def _marks_of(column: _Column, entries: Sequence[_Entry], used: set[str], paired
     if column.metric.cost:  # often shown beside the quality and not ranked
         used = {entry.cell.mark for entry in column.entries}
     yield from _one_mark(column, entries, found, "best", best, "best" in used, paired)
-    tied = [e for e in entries if not _among(e, best) and _within_noise(best[0].number, e.number, higher)]
+    tied = [e for e in entries if e not in best and _within_noise(best[0].number, e.number, higher)]
     sharing = [e for e in tied if e.cell.mark == "best"] if all(e.cell.mark == "best" for e in best) else []
     if sharing:  # the next one that is not called best may be called second
-        rest = [(e, rank) for e, rank in zip(entries, found, strict=True) if not _among(e, [*best, *sharing])]
+        rest = [(e, rank) for e, rank in zip(entries, found, strict=True) if e not in [*best, *sharing]]
         next_best = [e for e, rank in rest if rank == min(rank for _, rank in rest)]
         if not next_best:
             return
@@ -265,21 +256,19 @@ def _one_mark(
 ) -> Iterator[Finding]:
     higher = column.metric.higher_is_better
     marked = [entry for entry in entries if entry.cell.mark == mark]
-    worse = [e for e, rank in zip(entries, ranked, strict=True) if rank > ranked[_index(entries, right[0])]]
+    worse = [e for e, rank in zip(entries, ranked, strict=True) if rank > ranked[entries.index(right[0])]]
     noisy = [e for e in worse if _within_noise(right[0].number, e.number, higher)]
     names = " and ".join(f"{e.label} ({e.number.shown})" for e in right)
-    wrong = [
-        e for e in marked if not _among(e, right) and not (_among(e, noisy) and any(_among(r, marked) for r in right))
-    ]
+    wrong = [e for e in marked if e not in right and not (e in noisy and any(r in marked for r in right))]
     for entry in wrong:
-        rank = ranked[_index(entries, entry)]
+        rank = ranked[entries.index(entry)]
         yield column.finding(
             entry,
             f"wrong {MARKED[mark]} mark: {entry.number.shown} is {_ordinal(rank)} of {len(entries)}",
             f"the mark on {names}",
         )
-    having = [entry for entry in right if _among(entry, marked)]
-    missing = [entry for entry in right if not _among(entry, marked)]
+    having = [entry for entry in right if entry in marked]
+    missing = [entry for entry in right if entry not in marked]
     if having and missing:
         for entry in missing:
             yield column.finding(
@@ -296,7 +285,7 @@ def _one_mark(
         return
     for entry in noisy:
         # the best row is the second-best one's better, and a best that is marked too claims nothing over it
-        if not _among(entry, marked):
+        if entry not in marked:
             yield column.finding(
                 having[0],
                 f"claim within noise: {MARKED[mark]} mark, but {entry.label} ({entry.number.shown}) is not further "
@@ -314,14 +303,6 @@ def _within_noise(better: Number, worse: Number, higher: bool) -> bool:
     if not higher:
         down, up = (better.high - better.value, worse.value - worse.low)
     return abs(better.value - worse.value) <= math.hypot(max(down, 0.0), max(up, 0.0))
-
-
-def _index(entries: Sequence[_Entry], entry: _Entry) -> int:
-    return next(k for k, other in enumerate(entries) if other is entry)
-
-
-def _among(entry: _Entry, entries: Sequence[_Entry]) -> bool:
-    return any(other is entry for other in entries)
 
 
 def _ordinal(rank: int) -> str:

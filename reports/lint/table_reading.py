@@ -15,8 +15,7 @@ CELL = re.compile(
     rf"""\s*[~≈<>≤≥]?\s*(?P<value>{NUM}|∞)\s*(?P<unit>{UNITS})?\s*
     (?:±\s*(?P<half>{NUM})\s*
       |\[\s*(?P<low>{NUM})\s*[,;]\s*(?P<high>{NUM})\s*\]
-      |\((?P<digits>\d+)\)
-      |\+\s*(?P<above>\d*\.?\d+)\s*[-−]\s*(?P<below>\d*\.?\d+))?
+    )?
     \s*(?P<unit2>{UNITS})?\s*(?:\([-+−↑↓][^)]*\))?\s*[†‡§¶*∗⋆]*\s*""",
     re.VERBOSE,
 )  # fmt: skip
@@ -82,8 +81,7 @@ class ReadRow:
     label: str
     cells: tuple[ReadCell, ...]
     line: int
-    ruled_section: int = 0  # counted by full rules
-    titled_section: int = 0  # counted by rows that are a title
+    section: int = 0  # counted by full rules
 
     @property
     def ranked(self) -> bool:
@@ -119,25 +117,20 @@ def read_cell(styled: Styled, line: int) -> ReadCell:
     return ReadCell(text, line, _number(match), styled[match.start("value")][1])
 
 
-def _number(found: re.Match[str]) -> Number:
-    shown = found["value"].replace("−", "-")
+def _number(match: re.Match[str]) -> Number:
+    shown = match["value"].replace("−", "-")
     plain = shown.replace(",", "")
     value = math.inf if plain == "∞" else float(plain)
     mantissa = re.split("[eE]", plain)[0]
     decimals = len(mantissa.partition(".")[2])
     significant = len(mantissa.lstrip("+-0.").replace(".", ""))
-    unit = found["unit"] or found["unit2"] or ""
+    unit = match["unit"] or match["unit2"] or ""
     low = high = math.nan
-    if found["half"] is not None:
-        half = abs(_float(found["half"]))
+    if match["half"] is not None:
+        half = abs(_float(match["half"]))
         low, high = value - half, value + half
-    elif found["low"] is not None:
-        low, high = _float(found["low"]), _float(found["high"])
-    elif found["digits"] is not None:  # 24.65(12) is 24.65 ± 0.12
-        half = int(found["digits"]) * 10.0**-decimals
-        low, high = value - half, value + half
-    elif found["above"] is not None:
-        low, high = value - _float(found["below"]), value + _float(found["above"])
+    elif match["low"] is not None:
+        low, high = _float(match["low"]), _float(match["high"])
     return Number(shown, value, decimals, significant, unit, low, high)
 
 
@@ -152,22 +145,20 @@ def tables_of(grid: Grid) -> list[ReadTable]:
     """The tables in a grid: a row of metric names after rows of numbers begins another one."""
     rows = grid.rows
     width = max((len(row.cells) for row in rows), default=0)
-    found: list[ReadTable] = []
+    tables: list[ReadTable] = []
     heads: list[GridRow] = []
-    body: list[tuple[GridRow, int, int]] = []
-    first, ruled, titled = _leading_heads(rows, grid.heads), 0, 0
+    body: list[tuple[GridRow, int]] = []
+    first, section = _leading_heads(rows, grid.heads), 0
     for k, row in enumerate(rows):
-        ruled += row.ruled
+        section += row.ruled
         if k < first or (_is_head(row) and (body or not _has_numbers(row))):
             if body:
-                found += _table(grid, heads, body, width)
+                tables += _table(grid, heads, body, width)
                 heads, body = [], []
             heads.append(row)
-        elif _title(row) is not None:
-            titled += 1
         elif any(cell.text for cell in row.cells):
-            body.append((row, ruled, titled))
-    return [*found, *_table(grid, heads, body, width)]
+            body.append((row, section))
+    return [*tables, *_table(grid, heads, body, width)]
 
 
 def _leading_heads(rows: Sequence[GridRow], given: int) -> int:
@@ -190,31 +181,17 @@ def _is_head(row: GridRow) -> bool:
     return not _has_numbers(row) and any(head_metric(cell.text) for cell in row.cells[1:])
 
 
-def _title(row: GridRow) -> str | None:
-    """The text of a row that has only one, at its start or over all of it."""
-    if any(cell.number for cell in row.cells):
-        return None
-    texts = {cell.text for cell in row.cells if cell.text}
-    first = row.cells[0].text if row.cells else ""
-    return first if first and texts == {first} and len(row.cells) > 1 else None
-
-
-def _table(grid: Grid, heads: list[GridRow], body: list[tuple[GridRow, int, int]], width: int) -> list[ReadTable]:
+def _table(grid: Grid, heads: list[GridRow], body: list[tuple[GridRow, int]], width: int) -> list[ReadTable]:
     if not body:
         return []
     columns = [_head(heads, k, grid.line) for k in range(width)]
-    labels = _label_columns(columns, body)
-    names = _names([row for row, _, _ in body], labels)
-    rows = [
-        ReadRow(
-            name,
-            tuple([*row.cells, *[ReadCell("", row.line)] * (width - len(row.cells))][labels:]),
-            row.line,
-            ruled,
-            titled,
-        )
-        for name, (row, ruled, titled) in zip(names, body, strict=True)
-    ]
+    # how many columns at the left name a row: at least one, up to the first with a metric or a number
+    numbers = {k for row, _ in body for k, cell in enumerate(row.cells) if cell.number}
+    labels = next((k for k in range(1, width) if columns[k].metric or k in numbers), 1)
+    rows = []
+    for name, (row, section) in zip(_names([row for row, _ in body], labels), body, strict=True):
+        cells = [*row.cells, *[ReadCell("", row.line)] * (width - len(row.cells))]
+        rows.append(ReadRow(name, tuple(cells[labels:]), row.line, section))
     return [ReadTable(grid.line, tuple(columns[labels:]), tuple(rows), grid.paired)]
 
 
@@ -225,14 +202,6 @@ def _names(rows: Sequence[GridRow], labels: int) -> list[str]:
         return first
     joined = [" / ".join(dict.fromkeys(c.text for c in row.cells[:labels] if c.text)) for row in rows]
     return [name or f"row {k + 1}" for k, name in enumerate(joined)]
-
-
-def _label_columns(columns: Sequence[Head], body: Sequence[tuple[GridRow, int, int]]) -> int:
-    """How many columns at the left name a row: at least one, up to the first with a metric or a number."""
-    for k, head in enumerate(columns[1:], 1):
-        if head.metric or any(k < len(row.cells) and row.cells[k].number for row, _, _ in body):
-            return k
-    return 1
 
 
 def _head(heads: Sequence[GridRow], k: int, line: int) -> Head:
