@@ -20,6 +20,7 @@ from ihbench.clock.threads import one_torch_thread, single_threaded_libraries
 from ihbench.errors import BadInput
 from ihbench.kernels.measuring import Row, interleave, peak_mib, summary
 from ihbench.metrics.oracles.cases import Case, hashed, person_case
+from ihbench.metrics.oracles.libraries import as_torch, official_flip
 
 if TYPE_CHECKING:
     from ihbench.metrics.evaluate import Preset
@@ -74,7 +75,7 @@ def flip_rows(repeats: int, size: int = SIZE) -> list[Row]:
 
     steps: dict[str, tuple[type, Metric, str]] = {_short(t): (t, flip, "") for t in DTYPES}
     if find_spec("flip_evaluator") is not None:
-        steps["flip-evaluator f32"] = (np.float32, _flip_evaluator, "")
+        steps["flip-evaluator f32"] = (np.float32, official_flip, "")
     oracle = lambda small, _: flip_oracle(small.pred, small.truth)  # noqa: E731
     return _compared("flip", "a person", size, person_case, steps, oracle, repeats)
 
@@ -134,7 +135,7 @@ def _lpips_in_double(network: Network, small: Case) -> tuple[float, float]:
     package = network.package.double()
     try:
         for pair in ((small.pred, small.truth), _painted(small.pred, small.truth)):
-            x, y = (2 * _channels_first(padded(image)).double() - 1 for image in pair)
+            x, y = (2 * as_torch(padded(image)).double() - 1 for image in pair)
             with torch.no_grad():
                 found.append(float(package(x, y)))
     finally:
@@ -271,7 +272,7 @@ def _six(frame: Case) -> dict[str, Any]:
 def _ssim_torch(pred: NDArray, truth: NDArray) -> float:
     from ihbench.metrics.ssim_torch import ssim_map_torch
 
-    return float(ssim_map_torch(_channels_first(pred), _channels_first(truth)).mean())
+    return float(ssim_map_torch(as_torch(pred), as_torch(truth)).mean())
 
 
 def _scikit_image(pred: NDArray, truth: NDArray) -> float:
@@ -286,24 +287,11 @@ def _scikit_image(pred: NDArray, truth: NDArray) -> float:
 def _torchmetrics(pred: NDArray, truth: NDArray) -> float:
     from torchmetrics.functional.image import structural_similarity_index_measure
 
-    value: Any = structural_similarity_index_measure(_channels_first(pred), _channels_first(truth), data_range=1.0)
+    value: Any = structural_similarity_index_measure(as_torch(pred), as_torch(truth), data_range=1.0)
     return float(value)
 
 
 def _kornia(pred: NDArray, truth: NDArray) -> float:
     import kornia
 
-    return float(kornia.metrics.ssim(_channels_first(pred), _channels_first(truth), 11, 1.0).mean())
-
-
-def _flip_evaluator(pred: NDArray, truth: NDArray) -> float:
-    import flip_evaluator
-
-    reference, test = (np.ascontiguousarray(np.clip(image, 0, 1), np.float32) for image in (truth, pred))
-    return float(flip_evaluator.evaluate(reference, test, "LDR", applyMagma=False)[1])
-
-
-def _channels_first(image: NDArray) -> Any:
-    import torch
-
-    return torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None]
+    return float(kornia.metrics.ssim(as_torch(pred), as_torch(truth), 11, 1.0).mean())

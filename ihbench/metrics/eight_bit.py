@@ -19,6 +19,13 @@ def rounded(
     return _to_8bit(image.astype(np.float32) if image.dtype == np.float16 else image, np.rint)
 
 
+def displayed(
+    image: NDArray,  # [H, W, C] or [H, W], float in [0, 1] or uint8
+) -> NDArray[np.uint8]:
+    """The nearest 8-bit image, what is not a number in black."""
+    return image if image.dtype == np.uint8 else rounded(np.nan_to_num(image, posinf=1.0))
+
+
 def truncated(
     image: NDArray,  # [H, W, C] or [H, W], float in [0, 1] or uint8
 ) -> NDArray:

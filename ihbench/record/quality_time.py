@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ihbench.errors import BadInput
 from ihbench.metrics.aggregate import LARGEST
 from ihbench.metrics.identity import METRICS
+from ihbench.scene.spread import spread
 
 NEVER = math.inf  # seconds to a quality that the run did not reach
 
@@ -192,7 +193,6 @@ def round_targets(curves: Sequence[QualityCurve], count: int = 3) -> list[float]
             step = mantissa * 10.0 ** (exponent - k)
             rungs = [round(n * step, 12) for n in range(math.ceil(low / step + 1e-9), math.floor(high / step) + 1)]
             if len(rungs) >= count:
-                picked = np.linspace(0, len(rungs) - 1, count).round().astype(int)
-                chosen = [rungs[i] for i in picked]
+                chosen = [rungs[i] for i in spread(len(rungs), count)]
                 return chosen if curves[0].higher_is_better else chosen[::-1]
     return []

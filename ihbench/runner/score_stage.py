@@ -15,11 +15,12 @@ from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.images import write_png
-from ihbench.metrics.eight_bit import rounded
+from ihbench.metrics.eight_bit import displayed
 from ihbench.record.results import group_row, view_rows
 from ihbench.record.schema import score_lines
 from ihbench.record.source_digest import bench_code
 from ihbench.record.store import RunFolder
+from ihbench.scene.spread import spread
 from ihbench.scene.views import OccludedScene
 from ihbench.scoring.calibration import ROWS, Calibration
 from ihbench.scoring.contact_sheet import SheetRow, contact_sheet
@@ -59,7 +60,7 @@ class ScoreStage:
         def write_render(loaded: LoadedView, images: dict[str, NDArray | None]) -> None:
             image = images[name]
             if image is not None:
-                write_png(render_path(self.folder, loaded), _shown(image))
+                write_png(render_path(self.folder, loaded), displayed(image))
                 if look is not None:
                     look(loaded, image)
 
@@ -121,21 +122,11 @@ def render_path(folder: RunFolder, loaded: LoadedView) -> Path:
     return folder.renders / loaded.key.camera_id / f"{loaded.key.frame:06d}.png"
 
 
-def spread(n: int, k: int) -> list[int]:
-    """k of n indices, evenly spread from the first to the last."""
-    return sorted({int(i) for i in np.linspace(0, n - 1, min(k, n)).round()})
-
-
-def _shown(image: NDArray) -> NDArray[np.uint8]:
-    """The image in 8 bits, what is not finite in black."""
-    return rounded(np.nan_to_num(image, posinf=1.0) if image.dtype != np.uint8 else image)
-
-
 def _sheet_row(scene: OccludedScene, loaded: LoadedView, image: NDArray | None) -> SheetRow:
     protocol, capture = scene.protocol, scene.capture
     frames = protocol.training_frames(capture.name, capture.n_frames)
     nearest = min(range(len(frames)), key=lambda k: abs(frames[k] - loaded.key.frame))
     truth = loaded.view.image
-    shown = np.zeros_like(truth) if image is None else (_shown(image) / 255).astype(np.float32)
+    shown = np.zeros_like(truth) if image is None else (displayed(image) / 255).astype(np.float32)
     label = loaded.key.name + (" (no prediction)" if image is None else "")
     return SheetRow(label, scene.train[nearest].image, truth, shown, loaded.view.hidden)

@@ -20,6 +20,7 @@ from ihbench.render.triangles import triangle_areas
 from ihbench.scene.contracts import Capture, MaskState
 from ihbench.scene.occlusion import OcclusionPlan, withheld
 from ihbench.scene.protocol import Protocol
+from ihbench.scene.spread import spread
 from ihbench.scene.views import OccludedScene
 from ihbench.scene.visibility import Visibility, texel_visibility
 
@@ -82,7 +83,7 @@ def measure_scene(scene: OccludedScene) -> SceneMeasure:
 
     capture, protocol, hiding, body = scene.capture, scene.protocol, scene.hiding, scene.capture.model
     frames = hiding.frames
-    chosen = np.unique(np.linspace(0, len(frames) - 1, min(MEASURE_VIEWS, len(frames))).round().astype(int))
+    chosen = spread(len(frames), MEASURE_VIEWS)
     views = [_mask_view(capture, protocol, hiding, k) for k in chosen]
     texels = texel_table(body, TEXELS)
     seen = texel_visibility(views, body, texels)

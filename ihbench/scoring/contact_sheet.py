@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench.metrics.eight_bit import as_float
+from ihbench.metrics.eight_bit import as_float, displayed
 from ihbench.metrics.images import as_image, check_images
 
 COLUMNS = ("training input", "truth", "prediction", "error x4")
@@ -43,7 +43,7 @@ def error_image(prediction: NDArray[np.float32], truth: NDArray[np.float32]) -> 
     prediction, truth = (as_float(as_image(image, hdr=True)) for image in (prediction, truth))
     check_images(prediction, truth)
     error = np.abs(prediction - truth).mean(-1, keepdims=True) * 4
-    return np.repeat(_to_8bit(error), 3, -1)
+    return np.repeat(displayed(error), 3, -1)
 
 
 def contact_sheet(rows: Sequence[SheetRow], title: str, zoom: int = 1) -> NDArray[np.uint8]:
@@ -55,10 +55,10 @@ def contact_sheet(rows: Sequence[SheetRow], title: str, zoom: int = 1) -> NDArra
 
     cells = []
     for row in rows:
-        truth, error = _to_8bit(row.truth), error_image(row.prediction, row.truth)
+        truth, error = displayed(row.truth), error_image(row.prediction, row.truth)
         if row.hidden is not None:
             truth[row.hidden] = error[row.hidden] = GREY
-        images = (row.training, truth, _to_8bit(row.prediction), error)
+        images = (row.training, truth, displayed(row.prediction), error)
         window = _window(row)
         cut = [images[0][_window_of(row.training)]] + [image[window] for image in images[1:]]
         cells.append([image.repeat(zoom, 0).repeat(zoom, 1) for image in cut])
@@ -83,12 +83,8 @@ def contact_sheet(rows: Sequence[SheetRow], title: str, zoom: int = 1) -> NDArra
     return np.asarray(sheet)
 
 
-def _to_8bit(image: NDArray[np.float32]) -> NDArray[np.uint8]:
-    return np.round(np.clip(np.nan_to_num(image), 0, 1) * 255).astype(np.uint8)
-
-
 def _window(row: SheetRow) -> tuple[slice, slice]:
-    truth, prediction = _window_of(_to_8bit(row.truth)), _window_of(_to_8bit(row.prediction))
+    truth, prediction = _window_of(displayed(row.truth)), _window_of(displayed(row.prediction))
     return tuple(  # type: ignore[return-value]
         slice(min(a.start, b.start), max(a.stop, b.stop)) for a, b in zip(truth, prediction, strict=True)
     )

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.scene.regions import HIDDEN, NEVER_SEEN
+from ihbench.scene.spread import spread
 from ihbench.scene.views import straight_camera
 
 if TYPE_CHECKING:
@@ -35,9 +36,7 @@ def curve_views(scorer: Scorer, count: int) -> list[int]:
     if len(own) <= count:
         return own
     frames = sorted({keys[k].frame for k in own})
-    looked_at = {
-        frames[k] for k in np.linspace(0, len(frames) - 1, min(MOST_FRAMES, len(frames))).round().astype(int)
-    }
+    looked_at = {frames[k] for k in spread(len(frames), MOST_FRAMES)}
     own = [k for k in own if keys[k].frame in looked_at]
     asked = [keys[k] for k in own]
     traits = _weighted(_raw_traits(scorer, asked))

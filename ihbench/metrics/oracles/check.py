@@ -23,6 +23,7 @@ from ihbench.metrics import lpips
 from ihbench.metrics.evaluate import Preset, evaluate, find_preset
 from ihbench.metrics.flip import flip
 from ihbench.metrics.oracles.cases import Case, person_case
+from ihbench.metrics.oracles.libraries import as_torch, official_flip
 from ihbench.metrics.oracles.oracle import psnr_channels_oracle
 from ihbench.metrics.oracles.presets_oracle import ORACLES, preset_oracle
 from ihbench.metrics.oracles.reference_values import STORED
@@ -190,7 +191,7 @@ def _scikit_image(case: Case, x: NDArray, y: NDArray) -> Iterator[Outcome]:
 def _torchmetrics(case: Case, x: NDArray, y: NDArray) -> Iterator[Outcome]:
     from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
-    a, b = _as_torch(x), _as_torch(y)
+    a, b = as_torch(x), as_torch(y)
     yield "psnr", psnr(case.pred, case.truth), float(peak_signal_noise_ratio(a, b, data_range=1.0)), FLOAT32
     theirs: Any = structural_similarity_index_measure(a, b, data_range=1.0)
     yield "ssim gauss11 reflect", ssim(case.pred, case.truth, border="reflect"), float(theirs), FLOAT64
@@ -199,7 +200,7 @@ def _torchmetrics(case: Case, x: NDArray, y: NDArray) -> Iterator[Outcome]:
 def _kornia(case: Case, x: NDArray, y: NDArray) -> Iterator[Outcome]:
     import kornia
 
-    a, b = _as_torch(x), _as_torch(y)
+    a, b = as_torch(x), as_torch(y)
     yield "psnr", psnr(case.pred, case.truth), float(kornia.metrics.psnr(a, b, 1.0)), FLOAT64
     theirs = kornia.metrics.ssim(a, b, 11, 1.0)[0].permute(1, 2, 0).numpy()
     ours = ssim_map(case.pred, case.truth, window=Window(border="reflect"))
@@ -207,23 +208,13 @@ def _kornia(case: Case, x: NDArray, y: NDArray) -> Iterator[Outcome]:
 
 
 def _flip_evaluator(case: Case, x: NDArray, y: NDArray) -> Iterator[Outcome]:
-    import flip_evaluator
-
-    clipped = [np.ascontiguousarray(np.clip(image, 0, 1), np.float32) for image in (y, x)]
-    _, theirs, _ = flip_evaluator.evaluate(clipped[0], clipped[1], "LDR", applyMagma=False)
-    yield "flip", flip(case.pred, case.truth), float(theirs), FLOAT32
+    yield "flip", flip(case.pred, case.truth), official_flip(x, y), FLOAT32
 
 
 def _channels_psnr() -> Iterator[Comparison]:
     case = person_case(*LIBRARY_SIZE)
     theirs = psnr_channels_oracle(case.pred, case.truth)
     yield Comparison("mean_of_channels", case.name, "oracle", mean_of_channels(case.pred, case.truth), theirs, *EXACT)
-
-
-def _as_torch(image: NDArray) -> Any:
-    import torch
-
-    return torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None]
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -241,7 +232,7 @@ def package_distance(
 
     images = []
     for image in (pred, truth):
-        tensor = _as_torch(lpips.padded(image)).float()
+        tensor = as_torch(lpips.padded(image)).float()
         images.append(2 * tensor - 1 if feed == "[-1,1]" else tensor)
     with torch.no_grad():
         return float(package(*images))

@@ -157,9 +157,10 @@ class Stage2:
             )
         )
         if self.ledger.on_disk:
-            from ihbench.methods.inpainthuman.studies.grid import painted_grid, png
+            from ihbench.files.pictures import encoded
+            from ihbench.methods.inpainthuman.studies.grid import painted_grid
 
-            self.ledger.artifact("inpainting.png", png(painted_grid(views, painted, silhouettes)))
+            self.ledger.artifact("inpainting.png", encoded(painted_grid(views, painted, silhouettes), "PNG"))
 
     # --- resume ---
 

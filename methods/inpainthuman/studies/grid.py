@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from ihbench.diffusion.crops.crop_view import CropView
 from ihbench.diffusion.crops.part_map import part_colours
+from ihbench.scene.spread import spread
 
 GAP = 4  # px
 HIDDEN = np.array([255, 0, 200], np.uint8)  # a colour that nobody wears
@@ -21,9 +22,8 @@ def painted_grid(
 ) -> NDArray[np.uint8]:
     """[H, W, 3] one row per view: input, what is asked (magenta), part map, painted, silhouette, truth where known.
     At most `most` views, evenly spread."""
-    chosen = np.unique(np.linspace(0, len(views) - 1, min(most, len(views))).round().astype(int))
     rows = []
-    for k in chosen:
+    for k in spread(len(views), most):
         view = views[k]
         asked = np.where(view.unknown[..., None], HIDDEN, view.image)
         outline = np.where(silhouettes[k][..., None], painted[k], 40).astype(np.uint8)
@@ -40,14 +40,3 @@ def _framed(cell: NDArray[np.uint8], side: int) -> NDArray[np.uint8]:
     left = (side - cell.shape[1]) // 2
     out[: cell.shape[0], left : left + cell.shape[1]] = cell
     return out
-
-
-def png(image: NDArray[np.uint8]) -> bytes:
-    """[H, W, 3] RGB as a PNG file."""
-    from io import BytesIO
-
-    from PIL import Image
-
-    buffer = BytesIO()
-    Image.fromarray(image).save(buffer, "PNG")
-    return buffer.getvalue()

@@ -57,7 +57,7 @@ def main(argv: list[str]) -> int:
 def _paint(chosen: Any) -> int:
     from ihbench import registry
     from ihbench.clock.progress import Progress
-    from ihbench.methods.inpainthuman.studies.grid import png
+    from ihbench.files.pictures import encoded
     from ihbench.methods.inpainthuman.studies.paint_table import paint_scene, summary, table
     from ihbench.record import outputs
     from ihbench.scene.data_source import locate
@@ -93,7 +93,7 @@ def _paint(chosen: Any) -> int:
             device=chosen.device,
         )
         if chosen.out is not None:
-            outputs.write_bytes(chosen.out / f"{scene}.png", png(picture))
+            outputs.write_bytes(chosen.out / f"{scene}.png", encoded(picture, "PNG"))
             outputs.write_json(chosen.out / "paint.json", {"scenes": scenes, "summary": summary(scenes)})
     result = summary(scenes)
     text = table(result, f"{protocols[0].name}, {len(scenes)} scenes, {data}")
