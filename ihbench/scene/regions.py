@@ -74,8 +74,12 @@ class SurfaceMap:
             found[name] = region if view.hidden is None else region & ~view.hidden
         return found
 
-    def labels_in(self, vertices: NDArray[np.float64], camera: Camera) -> NDArray[np.uint8]:
-        """[H, W] label of the posed surface (vertices [V, 3] m, world) in every pixel, 0 where the body is not."""
+    def labels_in(
+        self,
+        vertices: NDArray[np.float64],  # [V, 3] m world, posed
+        camera: Camera,
+    ) -> NDArray[np.uint8]:
+        """[H, W] label of the posed surface in every pixel, 0 where the body is not."""
         from ihbench.body.uv import texel_at
 
         raster = rasterize(camera.project(vertices), self.body.faces, camera.height, camera.width)
@@ -103,7 +107,11 @@ class SurfaceMap:
         return out
 
 
-def projected_box(vertices: NDArray[np.float64], camera: Camera, padding: float) -> NDArray[np.bool_]:
+def projected_box(
+    vertices: NDArray[np.float64],  # [V, 3] m world
+    camera: Camera,
+    padding: float,
+) -> NDArray[np.bool_]:
     """[H, W] the convex outline of the body's axis-aligned world box, padded by `padding` m on every side.
 
     NeuralBody calls it mask_at_box (zju3dv/neuralbody lib/utils/if_nerf/if_nerf_data_utils.py).

@@ -178,19 +178,30 @@ class Undistorter:
             beyond = self.straighten(np.full((camera.height, camera.width), 255, np.uint8)) < 255
             self.unphotographed = self.shrink(beyond.astype(np.float32), "area") > 0 if beyond.any() else None
 
-    def straighten(self, image: NDArray[Any]) -> NDArray[Any]:
+    def straighten(
+        self,
+        image: NDArray[Any],  # [H, W] or [H, W, C], original size
+    ) -> NDArray[Any]:
+        """The same shape without lens distortion."""
         if self._maps is None:
             return image
         return self._cv2.remap(image, self._maps[0], self._maps[1], self._cv2.INTER_LINEAR)
 
-    def shrink(self, image: NDArray[Any], how: str) -> NDArray[Any]:
+    def shrink(
+        self,
+        image: NDArray[Any],  # [H, W] or [H, W, C], original size
+        how: str,
+    ) -> NDArray[Any]:
+        """[h, w] or [h, w, C] of the protocol's size."""
         return self._cv2.resize(image, self.size, interpolation=self._flags[how])
 
     def person(
-        self, image: NDArray[np.uint8], silhouette: NDArray[np.bool_]
+        self,
+        image: NDArray[np.uint8],  # [H, W, 3] the original
+        silhouette: NDArray[np.bool_],  # [H, W]
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """The person of the original image on the protocol's background, undistorted, resampled, 8 bit; and the
-        silhouette treated likewise."""
+        """[h, w, 3] the person on the protocol's background, undistorted, resampled, 8 bit; and [h, w] the silhouette
+        treated likewise."""
         alpha = self.straighten(silhouette.astype(np.uint8) * 255)
         if self._rule.edge == "hard":
             alpha = (alpha >= 128).astype(np.uint8) * 255
@@ -231,8 +242,11 @@ class Undistorter:
         maps = (m[rows, columns] for m in self._maps)
         return self._cv2.remap(image, *maps, self._cv2.INTER_LINEAR)
 
-    def touched(self, hidden: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Pixels with any part of a hidden original pixel in them: their colour is not to be trusted."""
+    def touched(
+        self,
+        hidden: NDArray[np.bool_],  # [H, W] of the original image
+    ) -> NDArray[np.bool_]:
+        """[h, w] pixels with any part of a hidden original pixel in them: their colour is not to be trusted."""
         return self.shrink((self.straighten(hidden.astype(np.uint8) * 255) > 0).astype(np.float32), "area") > 0
 
     def cut_off(self, body: Body, body_pose: BodyPose) -> NDArray[np.bool_] | None:

@@ -37,9 +37,12 @@ class SheetRow:
             )
 
 
-def error_image(prediction: NDArray[np.float32], truth: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Mean absolute error over the channels, times four: black is right, white is wrong by a quarter or more. uint8
-    images, whose differences would wrap around, become floats first."""
+def error_image(
+    prediction: NDArray[np.float32],  # [H, W, 3]
+    truth: NDArray[np.float32],  # [H, W, 3]
+) -> NDArray[np.uint8]:
+    """[H, W, 3] mean absolute error over the channels, times four: black is right, white is wrong by a quarter or
+    more. uint8 images, whose differences would wrap around, become floats first."""
     prediction, truth = (as_float(as_image(image, hdr=True)) for image in (prediction, truth))
     check_images(prediction, truth)
     error = np.abs(prediction - truth).mean(-1, keepdims=True) * 4

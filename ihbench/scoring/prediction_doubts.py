@@ -73,8 +73,12 @@ class Doubts:
         self._background = np.asarray(background, np.float64)
         self._looks: dict[int, _Look] = {}
 
-    def look(self, loaded: LoadedView, image: NDArray) -> None:
-        """Take in the prediction [H, W, 3] (uint8, or float in [0, 1]) of a view."""
+    def look(
+        self,
+        loaded: LoadedView,
+        image: NDArray,  # [H, W, 3] uint8, or float in [0, 1]
+    ) -> None:
+        """Take in the prediction of a view."""
         truth = loaded.view.image
         if image.shape != truth.shape:
             return
@@ -86,7 +90,7 @@ class Doubts:
         changed = [change(image)[rows, columns] for change in TURNS.values()]
         changed += [change(own) for change in COLOURS.values()]
 
-        def error(of: NDArray) -> float:
+        def error(of: NDArray) -> float:  # of [h, w, 3], like part
             return float(np.square(of - part).mean())
 
         behind = (np.abs(truth - self._background) < SAME / 2).all(2)

@@ -98,7 +98,12 @@ class Scorer:
         regions = self.surface.regions(view, self.region_names, self.scene.protocol.metrics.box_padding)
         return LoadedView(index, self.scene.test_keys[index], view, regions)
 
-    def score(self, loaded: LoadedView, image: NDArray | None, slow: bool = True) -> ViewScores:
+    def score(
+        self,
+        loaded: LoadedView,
+        image: NDArray | None,  # [H, W, 3] uint8 or float with peak 1
+        slow: bool = True,
+    ) -> ViewScores:
         """Score one image; pixels whose truth nobody knows count as right, also where windows reach them. Raises
         `BadInput` when it has another size, layout or range than the test view."""
         protocol = self.scene.protocol
