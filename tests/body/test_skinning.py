@@ -55,6 +55,20 @@ def test_axis_angle_gradient_is_right_at_every_angle(angle):
     assert torch.autograd.gradcheck(skinning.axis_angle_to_matrix, rotations, atol=1e-7)
 
 
+def test_axis_angle_and_its_gradient_agree_with_kornia():
+    """Away from 0, where kornia switches to a first-order formula."""
+    from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+
+    rotations = torch.from_numpy(np.concatenate([axes() * angle for angle in (0.1, 1, 3, 7)])).requires_grad_()
+    weight = torch.from_numpy(np.random.default_rng(1).normal(size=(len(rotations), 3, 3)))
+    results = []
+    for matrix in (skinning.axis_angle_to_matrix, axis_angle_to_rotation_matrix):
+        out = matrix(rotations)
+        results.append((out, *torch.autograd.grad((out * weight).sum(), rotations)))
+    for ours, theirs in zip(*results, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=0, atol=3e-5)  # kornia adds 1e-6 to the angle it divides by
+
+
 def test_axis_angle_gradient_at_zero_is_the_generators():
     rotation = torch.zeros(3, dtype=torch.float64, requires_grad=True)
     jacobian = torch.autograd.functional.jacobian(skinning.axis_angle_to_matrix, rotation)

@@ -24,6 +24,19 @@ def test_equals_the_oracle(shape, options):
     np.testing.assert_allclose(ssim_map_torch(pred, truth, **options).permute(1, 2, 0), expected, rtol=0, atol=1e-10)
 
 
+def test_map_and_gradient_agree_with_kornia():
+    """Where no window reaches the border, which kornia mirrors in another way."""
+    from kornia.metrics import ssim
+
+    results = []
+    for similarity in (ssim_map_torch, lambda a, b: ssim(a[None], b[None], 11)[0]):
+        pred, truth = (image.requires_grad_() for image in images(3, 30, 26))
+        inner = similarity(pred, truth)[:, 5:-5, 5:-5]
+        results.append((inner, *torch.autograd.grad(inner.square().sum(), (pred, truth))))
+    for ours, theirs in zip(*results, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-9)
+
+
 def test_float32_on_pictures():
     rows, columns = np.mgrid[:64, :64] / 64
     truth = np.stack([0.5 + 0.4 * np.sin(9 * rows + k * columns) for k in range(3)], -1)
