@@ -189,6 +189,7 @@ def ablate(
     `BadInput` for anything the caller got wrong.
     """
     from ihbench.commands.ablate import AblateOptions, ablated, write_out
+    from ihbench.document.document import write
 
     grids = {} if vary is None else vary
     for name, value in (("vary", grids), ("switches", switches or {})):
@@ -204,10 +205,10 @@ def ablate(
     )  # fmt: skip
     told = _progress(progress)
     fixed = {name: _plain(value) for name, value in (switches or {}).items()}
-    text, numbers, outcomes = ablated(given, values, fixed, told)
-    write_out(given, text, numbers)
+    blocks, numbers, outcomes = ablated(given, values, fixed, told)
+    write_out(given, blocks, numbers)
     return Ablation(
-        text,
+        write(blocks, "md"),
         numbers,
         [outcome.result for outcome in outcomes if outcome.result is not None],
         [f"{o.cell.name}: {o.problem or (o.result and o.result.outcome)}" for o in outcomes if not o.done],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, make_dataclass
 from pathlib import Path
@@ -16,12 +15,14 @@ from ihbench.clock.gpu_slots import card_slots, free_memory
 from ihbench.commands.options.device import check_device
 from ihbench.commands.options.keep import check_keep
 from ihbench.commands.options.parse import options
+from ihbench.commands.options.printing import Report
 from ihbench.commands.options.scene_choice import SceneChoice
 from ihbench.errors import BadInput
 from ihbench.scene.method_spec import method_spec
 
 if TYPE_CHECKING:
     from ihbench.clock.progress import Progress
+    from ihbench.document.document import Block
     from ihbench.runner.ablation import Ladder
     from ihbench.runner.executor import Cell, CellOutcome
     from ihbench.scene.data_source import DataSource
@@ -30,7 +31,7 @@ BETWEEN = ":"  # values of one switch
 
 
 @dataclass(frozen=True, kw_only=True)
-class AblateOptions(SceneChoice):
+class AblateOptions(SceneChoice, Report):
     ladder: str = ""
     """A ladder of the method, such as table2 (`--ladder list` shows them all); by default its first."""
     vary: tuple[str, ...] = ()
@@ -71,16 +72,16 @@ def _ablate(chosen: AblateOptions) -> int:
         for name, texts in _named(chosen.vary, "--vary").items()
     }
     switches = {name: _value(chosen, config, name, text) for name, text in _named(chosen.set, "--set").items()}
-    text, numbers, outcomes = ablated(chosen, vary, switches, Progress())
-    print(json.dumps(numbers, allow_nan=False) if chosen.json else text)
-    write_out(chosen, text, numbers)
+    blocks, numbers, outcomes = ablated(chosen, vary, switches, Progress())
+    chosen.show(numbers, blocks)
+    write_out(chosen, blocks, numbers)
     return 0 if all(outcome.done for outcome in outcomes) else 1
 
 
 def ablated(
     chosen: AblateOptions, vary: Mapping[str, Sequence[Any]], switches: Mapping[str, Any], progress: Progress
-) -> tuple[str, dict[str, Any], list[CellOutcome]]:
-    """Do the runs of a ladder, or of the grid `vary`, with `switches` on every rung: the table as Markdown and as
+) -> tuple[list[Block], dict[str, Any], list[CellOutcome]]:
+    """Do the runs of a ladder, or of the grid `vary`, with `switches` on every rung: the table and its
     numbers, and how each run ended. The options' own words for both are not read. Raises `BadInput`."""
     from ihbench.clock.machine import usable_cores
     from ihbench.record import outputs
@@ -103,16 +104,17 @@ def ablated(
     threads = max(cores // max(min(workers, len(cells)), 1), 1)
     outcomes = run_cells([cell for _, cell in cells], workers, threads, progress, cards)
     rungs = [rung for rung, _ in cells]
-    text, numbers = registry.load("table", "ablation")(ladder, list(zip(rungs, outcomes, strict=True)))
-    return text, numbers, outcomes
+    blocks, numbers = registry.load("table", "ablation")(ladder, list(zip(rungs, outcomes, strict=True)))
+    return blocks, numbers, outcomes
 
 
-def write_out(chosen: AblateOptions, text: str, numbers: dict[str, Any]) -> None:
+def write_out(chosen: AblateOptions, blocks: Sequence[Block], numbers: dict[str, Any]) -> None:
     """Write the table into the folder that was asked for, if one was."""
+    from ihbench.document.document import write
     from ihbench.record import outputs
 
     if chosen.out is not None:
-        outputs.write_text(chosen.out / "ablation.md", text)
+        outputs.write_text(chosen.out / "ablation.md", write(blocks, "md"))
         outputs.write_json(chosen.out / "ablation.json", numbers)
 
 

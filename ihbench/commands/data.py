@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,11 +12,13 @@ import tyro
 from ihbench import registry
 from ihbench.bounds import LARGEST_CAST, SEEDS, Within
 from ihbench.commands.options.parse import options
+from ihbench.commands.options.printing import Printing
+from ihbench.document.document import Block, Heading, Table
 from ihbench.errors import BadInput
 
 
 @dataclass(frozen=True)
-class Check:
+class Check(Printing):
     """Name the layout and variant found in a folder, what is missing (problems) and what is suspicious (warnings).
 
     Changes nothing. Status 0 also with warnings, 1 with problems."""
@@ -28,8 +29,6 @@ class Check:
     """SMPL model file for real data (or IHBENCH_BODY): poses are then held against the masks."""
     overlays: Path | None = None
     """Folder for a picture of each subject with the body's outline on its images; by default data_check."""
-    json: bool = False
-    """Print one JSON object on stdout."""
 
 
 @dataclass(frozen=True)
@@ -84,12 +83,26 @@ def _check(chosen: Check) -> int:
         if body is not None:
             mesh, warnings = look_at_mesh(body)
             report = replace(report, body_mesh=mesh, warnings=warnings)
-        print(json.dumps(report.as_json()) if chosen.json else "\n".join(_lines(report.as_json())))
+        found = report.as_json()
+        chosen.show(found, _blocks(found), "\n".join(_lines(found)))
         return 0 if report.ok else 1
     other = folder_nearby(folder, registry.names("dataset"))
     if other is not None:
         raise BadInput(f"data folder {folder}: no known layout; did you mean {other}?")
     raise BadInput(f"data folder {folder}: no known layout ({'; '.join(complaints)})")
+
+
+def _blocks(found: dict[str, Any]) -> list[Block]:
+    """A table of what is said of the copy, and one for each subject."""
+    blocks: list[Block] = [Heading(1, f"Data check: {found['root']}")]
+    for about in ({key: item for key, item in found.items() if key != "subjects"}, *found["subjects"]):
+        blocks.append(Heading(2, str(about.get("subject", found["dataset"]))))
+        rows: list[tuple[str, str]] = []
+        for key, item in about.items():
+            several = {f"{key}: {k}": v for k, v in item.items()} if isinstance(item, dict) else {key: item}
+            rows += [(k, "; ".join(map(str, v)) if isinstance(v, list) else str(v)) for k, v in several.items()]
+        blocks.append(Table(("what", "found"), tuple(rows), left=2))
+    return blocks
 
 
 def _lines(value: Any, indent: str = "") -> Iterator[str]:

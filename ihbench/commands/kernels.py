@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -10,25 +11,31 @@ import tyro
 
 from ihbench.bounds import Within
 from ihbench.commands.options.parse import options
+from ihbench.commands.options.printing import Printing
 
 
 @dataclass(frozen=True)
-class KernelOptions:
+class KernelOptions(Printing):
     kernel: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """Kernels to measure; none means all."""
     figure: Path | None = None
     """Folder for the work-precision diagram: PNG, SVG, and the numbers as CSV."""
     repeats: Annotated[int, Within(1, 10_000)] = 15
     """How often each is timed."""
-    json: bool = False
-    """Print one JSON object on stdout."""
 
 
 def main(argv: list[str]) -> int:
     chosen = options(
         KernelOptions, argv, "kernels", "Error against the float64 oracle, and milliseconds, per back end."
     )
-    from ihbench.kernels.table import run_kernels
+    from ihbench.clock import machine
+    from ihbench.kernels.table import blocks_of, run_kernels
 
-    run_kernels(chosen.kernel, chosen.json, chosen.repeats, chosen.figure)
+    rows = run_kernels(chosen.kernel, chosen.repeats)
+    about = machine.identity()
+    chosen.show({"machine": about, "rows": rows}, blocks_of(about, rows))
+    if chosen.figure is not None:
+        from ihbench.kernels.figure import draw
+
+        print(f"diagram: {draw(rows, about, chosen.figure)}, with the same name .svg and .csv", file=sys.stderr)
     return 0

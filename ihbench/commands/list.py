@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -12,6 +11,8 @@ import tyro
 from ihbench import registry
 from ihbench.commands import COMMANDS
 from ihbench.commands.options.parse import options
+from ihbench.commands.options.printing import Printing
+from ihbench.document.document import Block, Heading, Table
 from ihbench.errors import BadInput
 from ihbench.scene.method_spec import method_spec, usable_specs
 from ihbench.scene.protocol import load_protocol
@@ -19,14 +20,12 @@ from ihbench.scene.protocol import load_protocol
 KINDS = ("methods", "datasets", "protocols", "reports", "metrics")
 
 
-@dataclass(frozen=True)
-class ListOptions:
+@dataclass(frozen=True, kw_only=True)
+class ListOptions(Printing):
     kind: Annotated[
         Literal["all", "methods", "datasets", "protocols", "reports", "metrics"], tyro.conf.Positional
     ] = "all"
     """What to list."""
-    json: bool = False
-    """Print one JSON object on stdout."""
 
 
 def main(argv: list[str]) -> int:
@@ -35,14 +34,10 @@ def main(argv: list[str]) -> int:
     found = {kind: _DESCRIBE[kind]() for kind in kinds}
     if chosen.kind == "all":
         found |= _clashes()
-    if chosen.json:
-        print(json.dumps(found))
-        return 0
-    width = max((len(name) for rows in found.values() for name in rows), default=0)
+    blocks: list[Block] = []
     for kind, rows in found.items():
-        print(kind)
-        for name, about in rows.items():
-            print(f"  {name:<{width}}  {about}".rstrip())
+        blocks += [Heading(2, kind), Table(("name", "what it is"), tuple(rows.items()), left=2, bare=True)]
+    chosen.show(found, blocks)
     return 0
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from ihbench.commands.options.parse import options
+from ihbench.commands.options.printing import Printing
 from ihbench.commands.options.scene_choice import SceneChoice
+from ihbench.document.document import Block, Heading, Paragraph, bullets
 from ihbench.errors import BadInput
 
 if TYPE_CHECKING:
@@ -16,17 +17,19 @@ if TYPE_CHECKING:
 
 
 def main(argv: list[str]) -> int:
-    chosen = options(SceneChoice, argv, "plan", "What a run would do, what is left out and why. Runs nothing.")
+    chosen = options(PlanOptions, argv, "plan", "What a run would do, what is left out and why. Runs nothing.")
     from ihbench.scene.protocol import load_protocol
 
     protocols = chosen.apply(load_protocol(chosen.protocol, chosen.profile))
     reports = [_planned(chosen, protocol) for protocol in protocols]
-    if chosen.json:
-        print(json.dumps(reports[0] if len(reports) == 1 else {"protocols": reports}))
-        return 0
-    for report in reports:
-        _print(report)
+    blocks = [block for report in reports for block in _blocks(report)]
+    chosen.show(reports[0] if len(reports) == 1 else {"protocols": reports}, blocks)
     return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanOptions(SceneChoice, Printing):
+    """As `ihbench run` takes them."""
 
 
 def _planned(chosen: SceneChoice, protocol: Protocol) -> dict[str, Any]:
@@ -79,41 +82,44 @@ def _planned(chosen: SceneChoice, protocol: Protocol) -> dict[str, Any]:
     return report
 
 
-def _print(report: dict) -> None:
-    print(f"{report['method']} under {report['protocol']}, {report['profile']} profile, on {report['data']}")
+def _blocks(report: dict[str, Any]) -> list[Block]:
+    on = f"{report['method']} under {report['protocol']}, {report['profile']} profile, on {report['data']}"
     seconds = report["expected_seconds_per_scene"]
+    expected = "unknown, no earlier run of this protocol on such a processor to go by"
     if seconds:
         which = f"{report['earlier_runs']} earlier run{'s' * (report['earlier_runs'] > 1)} of this protocol"
         others = " with other switches" if report["earlier_runs_had_other_switches"] else ""
         others += " by other code" if report["earlier_runs_had_other_code"] else ""
-        print(f"expected: {seconds:.0f} s per scene, the median of {which} on such a processor{others}")
-    else:
-        print("expected: unknown, no earlier run of this protocol on such a processor to go by")
+        expected = f"{seconds:.0f} s per scene, the median of {which} on such a processor{others}"
+    blocks: list[Block] = [Paragraph(on), Paragraph(f"expected: {expected}")]
     for scene, found in report["scenes"].items():
-        print(f"\n{scene}")
-        if "note" in found:
-            print(f"  {found['note']}")
-            continue
-        m = found["measure"]
-        print(f"  {m['training_views']} training views ({m['covered_views']} occluded), {m['test_views']} test views")
-        print(f"  occlusion {_rule(m['occlusion'])}: hides {m['hidden_share']:.0%} of the person in occluded views")
-        if m["in_scene"]:
-            print(
-                "  the occluder stands in the scene: every frame is covered, what it hides in tests is in no region"
-            )
-        print(
-            f"  surface: {m['visible_texels']:.0%} seen, {m['hidden_texels']:.0%} only behind the occluder, "
-            f"{m['never_seen_texels']:.0%} never faced the camera"
+        blocks += [Heading(2, scene), *bullets([found["note"]] if "note" in found else _lines(found))]
+    return blocks
+
+
+def _lines(found: Mapping[str, Any]) -> list[str]:
+    """What was measured of a scene, and what is left out."""
+    m = found["measure"]
+    lines = [
+        f"{m['training_views']} training views ({m['covered_views']} occluded), {m['test_views']} test views",
+        f"occlusion {_rule(m['occlusion'])}: hides {m['hidden_share']:.0%} of the person in occluded views",
+    ]
+    if m["in_scene"]:
+        lines.append(
+            "the occluder stands in the scene: every frame is covered, what it hides in tests is in no region"
         )
-        print(f"  joints move up to {m['motion_deg']:.0f}°, the person turns {m['turn_deg']:.0f}°")
-        print(f"  a pixel of the protocol's image covers {m['pixel_mm']:.1f} mm of the body")
-        for o in found["left_out"]:
-            saved = f" (saves about {o['seconds']:.0f} s)" if o["seconds"] is not None else ""
-            print(f"  left out: {o['field']} -> {o['value']}: {o['reason']}{saved}")
-        if any(o["value"] is not None for o in found["left_out"]):
-            print("  `ihbench run --keep FIELD` keeps what the plan would change, `--keep all` everything")
-        if not found["left_out"]:
-            print("  left out: nothing; this scene needs all of it")
+    lines += [
+        f"surface: {m['visible_texels']:.0%} seen, {m['hidden_texels']:.0%} only behind the occluder, "
+        f"{m['never_seen_texels']:.0%} never faced the camera",
+        f"joints move up to {m['motion_deg']:.0f}°, the person turns {m['turn_deg']:.0f}°",
+        f"a pixel of the protocol's image covers {m['pixel_mm']:.1f} mm of the body",
+    ]
+    for o in found["left_out"]:
+        saved = f" (saves about {o['seconds']:.0f} s)" if o["seconds"] is not None else ""
+        lines.append(f"left out: {o['field']} -> {o['value']}: {o['reason']}{saved}")
+    if any(o["value"] is not None for o in found["left_out"]):
+        lines.append("`ihbench run --keep FIELD` keeps what the plan would change, `--keep all` everything")
+    return lines if found["left_out"] else [*lines, "left out: nothing; this scene needs all of it"]
 
 
 def _rule(occlusion: Mapping[str, Any]) -> str:

@@ -2,40 +2,37 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from typing import Annotated, Any
 
 import tyro
 
 from ihbench.commands.options.parse import options
+from ihbench.commands.options.printing import Printing
 from ihbench.commands.options.scene_choice import ProtocolChanges
+from ihbench.document.document import Table
 from ihbench.scene.occlusion import withheld
 from ihbench.scene.protocol import Protocol, difference, load_protocol, spelled
 
 
 @dataclass(frozen=True, kw_only=True)
-class Show(ProtocolChanges):
+class Show(ProtocolChanges, Printing):
     """Every choice of one protocol, and the regions that have no number under it."""
 
     protocol: Annotated[str, tyro.conf.Positional]
     """Name of the protocol."""
     profile: str = "paper"
     """Profile under which to show it."""
-    json: bool = False
-    """Print one JSON object on stdout."""
 
 
 @dataclass(frozen=True)
-class Diff:
+class Diff(Printing):
     """Where two protocols differ, key by key."""
 
     a: Annotated[str, tyro.conf.Positional]
     b: Annotated[str, tyro.conf.Positional]
     profile: str = "paper"
     """Profile under which to compare them."""
-    json: bool = False
-    """Print one JSON object on stdout."""
 
 
 Command = (
@@ -52,13 +49,8 @@ def main(argv: list[str]) -> int:
 def _show(chosen: Show) -> int:
     protocols = chosen.apply(load_protocol(chosen.protocol, chosen.profile))
     shown = [_shown(protocol) for protocol in protocols]
-    if chosen.json:
-        print(json.dumps(shown[0] if len(shown) == 1 else {"protocols": shown}))
-        return 0
-    for k, content in enumerate(shown):
-        values = spelled(content)
-        width = max(map(len, values))
-        print("\n" * bool(k) + "\n".join(f"{key:<{width}}  {value}" for key, value in values.items()))
+    tables = [Table(("choice", "value"), tuple(spelled(content).items()), left=2, bare=True) for content in shown]
+    chosen.show(shown[0] if len(shown) == 1 else {"protocols": shown}, tables)
     return 0
 
 
@@ -71,11 +63,8 @@ def _shown(protocol: Protocol) -> dict[str, Any]:
 def _diff(chosen: Diff) -> int:
     a, b = load_protocol(chosen.a, chosen.profile), load_protocol(chosen.b, chosen.profile)
     rows = difference(a, b)
-    if chosen.json:
-        print(json.dumps([{"key": k, chosen.a: x, chosen.b: y} for k, x, y in rows]))
-        return 0
-    for key, left, right in rows:
-        print(key)
-        print(f"  {a.name:<24}{left or '(not set)'}")
-        print(f"  {b.name:<24}{right or '(not set)'}")
+    cells = [(key, left or "(not set)", right or "(not set)") for key, left, right in rows]
+    text = "\n".join(f"{key}\n  {a.name:<24}{left}\n  {b.name:<24}{right}" for key, left, right in cells)
+    table = Table(("choice", a.name, b.name), tuple(cells), left=3)
+    chosen.show([{"key": k, chosen.a: x, chosen.b: y} for k, x, y in rows], [table], text)
     return 0

@@ -15,8 +15,9 @@ import tyro
 
 from ihbench import registry
 from ihbench.commands.options.parse import options
+from ihbench.commands.options.printing import Printing
+from ihbench.document.document import Table
 from ihbench.errors import BadInput
-from ihbench.files import atomic
 
 if TYPE_CHECKING:
     from ihbench.record.results import RunResult
@@ -27,7 +28,7 @@ UNITS = ("B", "kB", "MB", "GB", "TB")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Filters:
+class Filters(Printing):
     runs: Path = Path("runs")
     """Folder of run folders."""
     protocol: str | None = None
@@ -42,8 +43,6 @@ class Filters:
     """Only runs with this seed."""
     status: str | None = None
     """Only runs that are running, done, diverged, failed, interrupted, skipped, timeout or damaged."""
-    json: bool = False
-    """Print one JSON object on stdout and nothing else there."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,15 +73,8 @@ def main(argv: list[str]) -> int:
 
 def _list(chosen: Filters) -> int:
     rows = _matching(chosen)
-    if chosen.json:
-        print(json.dumps({"runs": atomic.encode(rows)}, allow_nan=False))
-        return 0
     columns = ("status", "protocol", "scene", "method", "profile", "seed", "headline", "age", "size", "folder")
-    cells = [columns, *(_cells(row) for row in rows)]
-    sizes = [max(len(line[k]) for line in cells) for k in range(len(columns) - 1)]
-    for line in cells:
-        padded = [f"{text:{size}}" for text, size in zip(line[:-1], sizes, strict=True)]
-        print("  ".join([*padded, line[-1]]))
+    chosen.show({"runs": rows}, [Table(columns, tuple(_cells(row) for row in rows), left=len(columns))])
     return 0
 
 

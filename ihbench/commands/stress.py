@@ -9,16 +9,15 @@ from typing import Annotated
 import tyro
 
 from ihbench.commands.options.parse import options
+from ihbench.commands.options.printing import Printing
 
 
 @dataclass(frozen=True)
-class StressOptions:
+class StressOptions(Printing):
     group: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """Groups to run: metrics, geometry, splat, data, training, ranking; none means all."""
     case: tuple[str, ...] = ()
     """Only the cases of these names."""
-    json: bool = False
-    """Print one JSON object on stdout."""
 
 
 def main(argv: list[str]) -> int:
@@ -28,15 +27,12 @@ def main(argv: list[str]) -> int:
     )  # fmt: skip
     from ihbench.clock.progress import Progress
     from ihbench.stress.run import chosen_cases, run_cases
-    from ihbench.stress.table import as_json, failures, print_table
+    from ihbench.stress.table import blocks_of, data_of, failures
 
     start, processor_start = time.perf_counter(), time.process_time()
     cases = chosen_cases(chosen.group, chosen.case)
     with Progress().task("stress", len(cases)) as task:
         outcomes = run_cases(cases, lambda outcome: task.advance())
     seconds = time.perf_counter() - start, time.process_time() - processor_start
-    if chosen.json:
-        print(as_json(outcomes, *seconds))
-    else:
-        print_table(outcomes, *seconds)
+    chosen.show(data_of(outcomes, *seconds), blocks_of(outcomes, *seconds))
     return 1 if failures(outcomes) else 0

@@ -2,30 +2,25 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from typing import Annotated
 
 import tyro
 
 from ihbench.commands.options.parse import options
+from ihbench.commands.options.printing import Printing
+from ihbench.document.document import Paragraph, Table
 from ihbench.metrics import weights
 
 
 @dataclass(frozen=True)
-class List:
+class List(Printing):
     """What weight files there are, what uses them, and whether they are here."""
-
-    json: bool = False
-    """Print one JSON object on stdout."""
 
 
 @dataclass(frozen=True)
-class Where:
+class Where(Printing):
     """The folders that are searched, and where each file is or belongs."""
-
-    json: bool = False
-    """Print one JSON object on stdout."""
 
 
 @dataclass(frozen=True)
@@ -49,17 +44,12 @@ def main(argv: list[str]) -> int:
         return _fetch(chosen)
     states = weights.states()
     folders = [str(folder) for folder in weights.folders()]
-    if chosen.json:
-        print(json.dumps({"folders": folders, "weights": states}))
-    elif isinstance(chosen, Where):
-        print("\n".join(f"searched: {folder}" for folder in folders))
-        print("\n".join(f"{s['name']:<14} {s['state']:<8} {s['path']}" for s in states))
-    else:
-        print(
-            "\n".join(
-                f"{s['name']:<14} {s['state']:<8} {s['size_mb']:>6} MB  {s['file']}  {s['used_by']}" for s in states
-            )
-        )
+    where = isinstance(chosen, Where)
+    keys = ("name", "state", "path") if where else ("name", "state", "file", "used_by", "size_mb")
+    head = [{"used_by": "used by", "size_mb": "MB"}.get(key, key) for key in keys]
+    rows = tuple(tuple(str(state[key]) for key in keys) for state in states)
+    searched = [Paragraph(f"searched: {folder}") for folder in folders if where]
+    chosen.show({"folders": folders, "weights": states}, [*searched, Table(tuple(head), rows, left=4, bare=True)])
     return 1 if any(s["state"] == "damaged" for s in states) else 0
 
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ihbench.document.document import Block, Column, Heading, Number, Table, plain_text
+from ihbench.document.document import Block, Bullets, Column, Heading, Number, Paragraph, Table, plain_text
 from ihbench.errors import visible
 
 FORMULA = ("=", "+", "-", "@", "\t", "\r")  # what a spreadsheet runs
@@ -17,7 +17,9 @@ FORMULA = ("=", "+", "-", "@", "\t", "\r")  # what a spreadsheet runs
 
 def write(blocks: Sequence[Block], folder: Path = Path(".")) -> str:
     """The rows of every table under its head; where there are several, the first column names the heading or title
-    that each stands under, and an empty line is between two."""
+    that each stands under, and an empty line is between two. Where there is none, what is said line by line."""
+    if not any(isinstance(block, Table) for block in blocks):
+        blocks = [Table(("under", "text"), tuple(_sentences(blocks)))]
     out = io.StringIO()
     lines = csv.writer(out, lineterminator="\n")
     several, under = sum(isinstance(block, Table) for block in blocks) > 1, ""
@@ -32,6 +34,16 @@ def write(blocks: Sequence[Block], folder: Path = Path(".")) -> str:
                 cells = [*([first] if several else []), *map(plain_text, row)]
                 lines.writerow([harmless(cell) for cell in cells])
     return out.getvalue()
+
+
+def _sentences(blocks: Sequence[Block]) -> Iterator[tuple[str, str]]:
+    under = ""
+    for block in blocks:
+        if isinstance(block, Heading):
+            under = block.text
+        elif isinstance(block, Paragraph | Bullets):
+            for words in (block.words,) if isinstance(block, Paragraph) else block.items:
+                yield under, plain_text(words)
 
 
 def write_cells(about: Mapping[str, str], tables: Sequence[Table], footnotes: Mapping[str, str]) -> str:

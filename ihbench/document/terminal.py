@@ -21,7 +21,9 @@ def write(blocks: Sequence[Block], folder: Path = Path("."), styled: bool = Fals
     from rich.text import Text
 
     out = StringIO()
-    console = Console(file=out, force_terminal=styled, color_system="standard", highlight=False, width=1 << 15)
+    console = Console(
+        file=out, force_terminal=styled, color_system="standard" if styled else None, highlight=False, width=1 << 15
+    )
     before: Block | None = None
     for block in blocks:
         if before is not None and (isinstance(block, Heading) or isinstance(before, Table)):
@@ -73,7 +75,7 @@ def _table(table: Table) -> Iterator[Line]:
         if not table.bare and k > 0 and table.begins_section(k - 1):
             yield []
         yield line
-        if not table.bare and k == 0:
+        if not table.bare and k == 0 and table.left < len(table.head):
             yield [("─" * (sum(widths) + GAP * (len(widths) - 1)), "")]
 
 

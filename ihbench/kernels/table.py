@@ -6,12 +6,10 @@ number of repetitions to table rows.
 
 from __future__ import annotations
 
-import json
-import sys
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
-from ihbench.clock import machine, streams
+from ihbench.clock import machine
+from ihbench.document.document import Block, Paragraph, Table
 from ihbench.errors import BadInput
 from ihbench.kernels.measuring import UNSTABLE, Row
 from ihbench.kernels.metrics import flip_rows, frame_rows, lpips_rows, ssim_rows
@@ -24,21 +22,16 @@ from ihbench.kernels.zbuffers import zbuffer_rows
 from ihbench.scene.method_spec import usable_specs
 
 REPEATS = 15
-TABLE_WIDTH = 118  # characters; a narrower terminal would cut the numbers
 
 
-def run_kernels(
-    names: Sequence[str] | None = None, as_json: bool = False, repeats: int = REPEATS, figure: Path | None = None
-) -> list[Row]:
-    """Measure the kernels called `names` (all of them by default) and print the result; returns its rows.
+def run_kernels(names: Sequence[str] | None = None, repeats: int = REPEATS) -> list[Row]:
+    """Measure the kernels called `names` (all of them by default); returns the rows.
 
-    Prints a table, or with `as_json` one JSON object {"machine": …, "rows": […]}. A row has kernel, case, backend,
-    the median and the interquartile range of the timings in ms (None where the kernel has no backward pass), the
-    memory the work needs beside its input in MiB, the errors against the twin, `unstable`, and `ratio`, its forward
-    time over that of the first back end of its case. With `figure`, the work-precision diagram and its numbers are
-    written into that folder.
+    A row has kernel, case, backend, the median and the interquartile range of the timings in ms (None where the
+    kernel has no backward pass), the memory the work needs beside its input in MiB, the errors against the twin,
+    `unstable`, and `ratio`, its forward time over that of the first back end of its case.
 
-    Raises BadInput for an unknown name, fewer than one repetition, or a folder that cannot be written.
+    Raises BadInput for an unknown name or fewer than one repetition.
     """
     of_methods = {name: (spec, kernel) for spec in usable_specs() for name, kernel in spec.kernels.items()}
     known = dict.fromkeys([*KERNELS, *of_methods])
@@ -53,16 +46,6 @@ def run_kernels(
     first: dict[tuple[str, str], float] = {}
     for row in rows:
         row["ratio"] = row["forward_ms"] / first.setdefault((row["kernel"], row["case"]), row["forward_ms"])
-    about = machine.identity()
-    if as_json:
-        print(json.dumps({"machine": about, "rows": rows}))
-    else:
-        _print_table(about, rows)
-    if figure is not None:
-        from ihbench.kernels.figure import draw
-
-        drawn = draw(rows, about, figure)
-        print(f"diagram: {drawn}, with the same name .svg and .csv", file=sys.stderr)
     return rows
 
 
@@ -80,16 +63,9 @@ KERNELS: dict[str, Callable[[int], list[Row]]] = {
 }
 
 
-def _print_table(about: Row, rows: list[Row]) -> None:
-    from rich.box import SIMPLE
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(
-        *("kernel", "case", "back end", "fwd ms", "ratio", "bwd ms", "MiB", "error", "grad err", ""),
-        pad_edge=False,
-        box=SIMPLE,
-    )
+def blocks_of(about: Row, rows: Sequence[Row]) -> list[Block]:
+    """The rows as a table, the machine, and what the numbers are."""
+    cells = []
     for row in rows:
         forward, backward = (
             "–" if row[f"{k}_ms"] is None else f"{_digits(row[f'{k}_ms'])}±{_digits(row[f'{k}_iqr_ms'] / 2)}"
@@ -99,15 +75,13 @@ def _print_table(about: Row, rows: list[Row]) -> None:
         errors = ("–" if row[k] is None else f"{row[k]:.0e}" for k in ("value_error", "gradient_error"))
         note = "unstable" if row["unstable"] else ""
         of = row["kernel"], row["case"], row["backend"]
-        table.add_row(*of, forward, f"{row['ratio']:.2f}", backward, memory, *errors, note)
-    console = Console(width=max(Console().width, TABLE_WIDTH))
-    with streams.styled():
-        console.print(table)
+        cells.append((*of, forward, f"{row['ratio']:.2f}", backward, memory, *errors, note))
+    head = ("kernel", "case", "back end", "fwd ms", "ratio", "bwd ms", "MiB", "error", "grad err", "note")
     gpu = f", {about['gpu']}" if about["gpu"] else ""
-    print(f"{about['cpu']}, {about['torch_threads']} threads{gpu}, load average {about['load_average']}")
+    lines = [f"{about['cpu']}, {about['torch_threads']} threads{gpu}, load average {about['load_average']}"]
     if busy(about):
-        print(f"Other work is running here (load above {machine.BUSY} per core): these times are unstable.")
-    print(
+        lines.append(f"Other work is running here (load above {machine.BUSY} per core): these times are unstable.")
+    lines.append(
         f"Median ± half the interquartile range; unstable: the range exceeds {UNSTABLE:.0%} of the median; ratio: of"
         " the forward time to that of the case's first row. Errors of splats are against the float64 twin in a window"
         f" of {WINDOW}² px (image: largest; gradient: relative norm), those of the z-buffer its depth's, in m,"
@@ -115,6 +89,7 @@ def _print_table(about: Row, rows: list[Row]) -> None:
         " float64), those of skinning and position maps the largest distance in m from float64 numpy, those of the"
         " sampler the rms over hidden pixels from many steps in float64."
     )
+    return [Table(head, tuple(cells), left=3), *map(Paragraph, lines)]
 
 
 def busy(about: Row) -> bool:

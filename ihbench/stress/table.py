@@ -1,34 +1,29 @@
-"""Printing what became of the cases."""
+"""What became of the cases, in words and as data."""
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter
 from collections.abc import Sequence
-from itertools import groupby
 from typing import Any
 
-from ihbench.clock import streams
+from ihbench.document.document import Block, Paragraph, RowLabel, Table
 from ihbench.stress.case import Outcome
 
-TABLE_WIDTH = 150  # characters; a narrower terminal would cut the numbers
 UNITS = {"ulp": "ulp", "relative": "rel", "absolute": "abs", "at most": "over", "words": "words"}
 
 
-def as_json(outcomes: Sequence[Outcome], seconds: float, processor_seconds: float) -> str:
-    """One strict JSON object {"ok", "seconds", …, "machine", "cases": […]}; NaN and infinities as in `atomic`."""
+def data_of(outcomes: Sequence[Outcome], seconds: float, processor_seconds: float) -> dict[str, Any]:
+    """{"ok", "seconds", …, "machine", "cases": […]}."""
     from ihbench.clock import machine
-    from ihbench.files.atomic import encode
 
-    found = {
+    return {
         "ok": not failures(outcomes),
         "seconds": seconds,
         "processor_seconds": processor_seconds,
         "machine": machine.identity(),
         "cases": [outcome.row() for outcome in outcomes],
     }
-    return json.dumps(encode(found), allow_nan=False)
 
 
 def failures(outcomes: Sequence[Outcome]) -> list[Outcome]:
@@ -36,32 +31,17 @@ def failures(outcomes: Sequence[Outcome]) -> list[Outcome]:
     return [outcome for outcome in outcomes if outcome.verdict == "failed"]
 
 
-def print_table(outcomes: Sequence[Outcome], seconds: float, processor_seconds: float) -> None:
+def blocks_of(outcomes: Sequence[Outcome], seconds: float, processor_seconds: float) -> list[Block]:
     """A table of every case; then, in words, what failed and why, what else was seen, and why errors are allowed."""
-    from rich.box import SIMPLE
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(box=SIMPLE, pad_edge=False)
-    for head in ("case", "what", "got", "expected", "error", "allowed", "condition", "s", ""):
-        table.add_column(head, no_wrap=head != "what", justify="right" if head == "s" else "left")
-    for _, group in groupby(outcomes, key=lambda outcome: outcome.case.group):
-        for outcome in group:
-            table.add_row(*_cells(outcome))
-        table.add_section()
-    with streams.styled():
-        Console(width=max(Console().width, TABLE_WIDTH)).print(table)
-    for outcome in outcomes:
-        if outcome.verdict != "passed":
-            print(f"{outcome.verdict}: {outcome.case.name}: {outcome.reason}")
-    for outcome in outcomes:
-        if outcome.note:
-            print(f"seen: {outcome.case.name}: {outcome.note}")
+    head = ("case", "what", "got", "expected", "error", "allowed", "condition", "s", "verdict")
+    labels = tuple(RowLabel(outcome.case.name, outcome.case.group) for outcome in outcomes)
+    lines = [f"{o.verdict}: {o.case.name}: {o.reason}" for o in outcomes if o.verdict != "passed"]
+    lines += [f"seen: {outcome.case.name}: {outcome.note}" for outcome in outcomes if outcome.note]
     for why in dict.fromkeys(outcome.case.why for outcome in outcomes):
-        allowed = [(o.case.tolerance, UNITS[o.case.unit]) for o in outcomes if o.case.why == why]
-        tolerance, unit = max(allowed)
-        print(f"allowed up to {tolerance:g} {unit}: {why}")
-    print(f"{summary(outcomes)}, in {seconds:.1f} s ({processor_seconds:.1f} s of processor time)")
+        tolerance, unit = max((o.case.tolerance, UNITS[o.case.unit]) for o in outcomes if o.case.why == why)
+        lines.append(f"allowed up to {tolerance:g} {unit}: {why}")
+    lines.append(f"{summary(outcomes)}, in {seconds:.1f} s ({processor_seconds:.1f} s of processor time)")
+    return [Table(head, tuple(map(_cells, outcomes)), left=4, labels=labels), *map(Paragraph, lines)]
 
 
 def summary(outcomes: Sequence[Outcome]) -> str:
@@ -73,11 +53,11 @@ def summary(outcomes: Sequence[Outcome]) -> str:
     return f"{len(outcomes)} cases ({counts}): {told}"
 
 
-def _cells(outcome: Outcome) -> list[str]:
+def _cells(outcome: Outcome) -> tuple[str, ...]:
     case = outcome.case
     words = case.unit == "words"
     unit = UNITS[case.unit]
-    return [
+    return (
         case.name,
         case.what,
         "in words" if words else _number(outcome.value),
@@ -87,7 +67,7 @@ def _cells(outcome: Outcome) -> list[str]:
         "–" if outcome.condition is None else f"{outcome.condition:.1g}",
         f"{outcome.seconds:.1f}",
         "" if outcome.verdict == "passed" else outcome.verdict.upper(),
-    ]
+    )
 
 
 def _number(value: Any) -> str:

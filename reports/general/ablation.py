@@ -9,11 +9,13 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from ihbench.document.document import Block, Heading, Paragraph, Table, Words, bullets
 from ihbench.metrics import Identity
 from ihbench.metrics.identity import Metric, metric_of
 from ihbench.metrics.statistics import Interval, holm, mean_interval, paired_test
 from ihbench.record.results import RunResult
 from ihbench.reports.general.clock import clock_notes, one_clock
+from ihbench.reports.general.content import data_words
 from ihbench.reports.general.significance import ALPHA, LEVEL, per_scene
 from ihbench.runner.ablation import Comparison, Ladder
 from ihbench.runner.executor import CellOutcome
@@ -24,44 +26,44 @@ PAPER = {"psnr": ("PSNR", 2), "ssim": ("SSIM", 4), "lpips": ("LPIPS*", 2)}
 Found = list[tuple[str, CellOutcome]]  # rung and outcome of every run
 
 
-def write(ladder: Ladder, found: Found) -> tuple[str, dict[str, Any]]:
-    """Markdown, and the same numbers for programs (strict JSON). One table for each protocol."""
+def write(ladder: Ladder, found: Found) -> tuple[list[Block], dict[str, Any]]:
+    """The document, and its numbers for programs (strict JSON). One table for each protocol."""
     protocols: dict[str, Found] = {}
     for rung, outcome in found:
         protocols.setdefault(outcome.cell.request.protocol.name, []).append((rung, outcome))
-    lines = [f"## Ablation: {ladder.title}", ""]
+    blocks: list[Block] = [Heading(2, f"Ablation: {ladder.title}")]
     tables = []
     for protocol, cells in protocols.items():
-        text, numbers = _table(ladder, protocol, cells)
-        lines += [*text, ""]
+        told, numbers = _table(ladder, protocol, cells)
+        blocks += told
         tables.append(numbers)
     if len(tables) > 1:
-        lines += [*_severities(ladder, tables), ""]
+        blocks += _severities(ladder, tables)
     failures = [_failure(outcome) for _, outcome in found if not outcome.done]
     if failures:
-        lines += ["Not done:", "", *(f"- {line}" for line in failures), ""]
+        blocks += [Paragraph("Not done:"), *bullets(failures)]
     if ladder.note:
-        lines += [ladder.note, ""]
-    return "\n".join(lines).rstrip() + "\n", {"ladder": ladder.title, "tables": tables, "failed": failures}
+        blocks.append(Paragraph(ladder.note))
+    return blocks, {"ladder": ladder.title, "tables": tables, "failed": failures}
 
 
-def _table(ladder: Ladder, protocol: str, cells: Found) -> tuple[list[str], dict[str, Any]]:
+def _table(ladder: Ladder, protocol: str, cells: Found) -> tuple[list[Block], dict[str, Any]]:
     runs: dict[str, list[RunResult]] = {rung.name: [] for rung in ladder.rungs}
     for rung, outcome in cells:
         if outcome.done and outcome.result is not None:
             runs[rung].append(outcome.result)
     done = [run for having in runs.values() for run in having]
     request = cells[0][1].cell.request
-    lines = [f"### {protocol}, {request.method}, {request.protocol.profile} profile", ""]
+    blocks: list[Block] = [Heading(3, f"{protocol}, {request.method}, {request.protocol.profile} profile")]
     if not done:
-        return [*lines, "No run was finished."], {"protocol": protocol, "rungs": {}, "comparisons": []}
+        return [*blocks, Paragraph("No run was finished.")], {"protocol": protocol, "rungs": {}, "comparisons": []}
     headline = done[0].record["about"]["headline"]
     columns = _columns(done, headline)
     quoted = [m for m in PAPER if any(m in rung.paper for rung in ladder.rungs)]
     titles = [f"{metric_of(i).title} {Identity.parse(i).region} {metric_of(i).arrow}" for i in columns]
     titles += ["fit s"] + [f"paper's {PAPER[m][0]}" for m in quoted]
-    lines += [f"Data: {done[0].data}.", ""]
-    lines += ["| rung | scenes | runs | " + " | ".join(titles) + " |", "|---|---:|---:|" + "---:|" * len(titles)]
+    blocks.append(Paragraph(("Data: ", *data_words(done[0]), ".")))
+    lines: list[tuple[Words, ...]] = []
     rungs: dict[str, Any] = {}
     for rung in ladder.rungs:
         having = runs[rung.name]
@@ -72,7 +74,7 @@ def _table(ladder: Ladder, protocol: str, cells: Found) -> tuple[list[str], dict
         cells_shown += [f"{rung.paper[m]:.{PAPER[m][1]}f}" if m in rung.paper else "" for m in quoted]
         counted = f"{len(having)}" if len(having) == asked else f"{len(having)} of {asked}"
         scenes = len({run.scene for run in having})
-        lines.append(f"| {rung.name} | {scenes} | {counted} | " + " | ".join(cells_shown) + " |")
+        lines.append((rung.name, str(scenes), counted, *cells_shown))
         rungs[rung.name] = {
             "switches": {name: _plain(value) for name, value in rung.switches.items()},
             "runs": len(having),
@@ -82,13 +84,15 @@ def _table(ladder: Ladder, protocol: str, cells: Found) -> tuple[list[str], dict
             "left_out": _omissions(having),
             "paper": dict(rung.paper),
         }
-    lines += ["", *(f"- {note}" for note in [*_left_out(runs), *clock_notes(_timed(runs))])]
+    blocks.append(Table(("rung", "scenes", "runs", *titles), tuple(lines)))
+    blocks += bullets([*_left_out(runs), *clock_notes(_timed(runs))])
     told, compared = _comparisons(ladder.comparisons, runs, columns)
     if quoted:
-        lines += ["", "The paper's numbers are quoted: its own data, whole images, LPIPS* = 1000 × LPIPS."]
+        quoted_from = "The paper's numbers are quoted: its own data, whole images, LPIPS* = 1000 × LPIPS."
+        blocks.append(Paragraph(quoted_from))
     if told:
-        lines += ["", "What each component is worth (paired over scenes, mean over seeds):", "", *told]
-    return lines, {"protocol": protocol, "headline": headline, "rungs": rungs, "comparisons": compared}
+        blocks += [Paragraph("What each component is worth (paired over scenes, mean over seeds):"), *told]
+    return blocks, {"protocol": protocol, "headline": headline, "rungs": rungs, "comparisons": compared}
 
 
 def _omissions(runs: Sequence[RunResult]) -> dict[str, int]:
@@ -131,7 +135,7 @@ def _columns(runs: Sequence[RunResult], headline: str) -> list[str]:
 
 def _comparisons(
     wanted: Sequence[Comparison], runs: Mapping[str, Sequence[RunResult]], columns: Sequence[str]
-) -> tuple[list[str], list[dict[str, Any]]]:
+) -> tuple[list[Block], list[dict[str, Any]]]:
     """A table of differences, p adjusted over a column's comparisons; and the numbers."""
     found: list[dict[str, Any]] = []
     for comparison in wanted:
@@ -152,28 +156,22 @@ def _comparisons(
     if not found:
         return [], []
     titles = [f"{metric_of(i).title} {Identity.parse(i).region} {metric_of(i).arrow}" for i in columns]
-    lines = [
-        "| component | scenes | " + " | ".join(titles) + " | fit s |",
-        "|---|---:|" + "---:|" * (len(titles) + 1),
-    ]
+    lines: list[tuple[Words, ...]] = []
     for row in found:
         n = max(pair["n"] for pair in row["scores"].values() if pair)
         cells = [_difference(row["scores"][i], metric_of(i)) for i in columns]
         cells.append(_seconds_text(row["fit_seconds"]))
-        lines.append(f"| {row['what']} | {n} | " + " | ".join(cells) + " |")
+        lines.append((row["what"], str(n), *cells))
     if impossible:
-        lines += [
-            "",
-            f"[{LEVEL:.0%} interval]; * better or worse with p < {ALPHA} (sign-flip test, Holm over the rows).",
-        ]
+        said = f"[{LEVEL:.0%} interval]; * better or worse with p < {ALPHA} (sign-flip test, Holm over the rows)."
         if min(impossible) >= ALPHA:
-            lines.append(
-                f"With so few scenes for so many comparisons no adjusted p can be below {min(impossible):.2g}, so "
+            said += (
+                f" With so few scenes for so many comparisons no adjusted p can be below {min(impossible):.2g}, so "
                 f"nothing can be marked: read the intervals, or ask less with --vary."
             )
     else:
-        lines += ["", "One scene: differences have no interval and no test."]
-    return lines, found
+        said = "One scene: differences have no interval and no test."
+    return [Table(("component", "scenes", *titles, "fit s"), tuple(lines)), Paragraph(said)], found
 
 
 def _of_both(a: Sequence[RunResult], b: Sequence[RunResult]) -> tuple[list[RunResult], list[RunResult]]:
@@ -230,22 +228,19 @@ def _seconds_text(pair: dict[str, Any] | None) -> str:
     return f"{pair['mean']:+z.0f}{interval}{share}"
 
 
-def _severities(ladder: Ladder, tables: Sequence[Mapping[str, Any]]) -> list[str]:
+def _severities(ladder: Ladder, tables: Sequence[Mapping[str, Any]]) -> list[Block]:
     """One line a rung, one column a protocol: the headline's first metric."""
     having = [table for table in tables if table["rungs"]]
     if not having:
         return []
     first = next(iter(next(iter(having[0]["rungs"].values()))["scores"]))
     metric = metric_of(first)
-    lines = [f"### {metric.title} {Identity.parse(first).region} {metric.arrow} over protocols", ""]
-    lines.append("| rung | " + " | ".join(table["protocol"] for table in having) + " |")
-    lines.append("|---|" + "---:|" * len(having))
+    lines: list[tuple[Words, ...]] = []
     for rung in ladder.rungs:
         scores = [table["rungs"].get(rung.name, {}).get("scores", {}).get(first) for table in having]
-        lines.append(
-            f"| {rung.name} | " + " | ".join("—" if s is None else metric.text(s["mean"]) for s in scores) + " |"
-        )
-    return lines
+        lines.append((rung.name, *("—" if s is None else metric.text(s["mean"]) for s in scores)))
+    title = f"{metric.title} {Identity.parse(first).region} {metric.arrow} over protocols"
+    return [Heading(3, title), Table(("rung", *(table["protocol"] for table in having)), tuple(lines))]
 
 
 def _seconds(runs: Sequence[RunResult]) -> dict[str, float]:

@@ -101,7 +101,7 @@ def _group(runs: list[RunResult], presets: Sequence[str], targets: Sequence[Targ
     protocol, digest, profile, _ = runs[0].group
     blocks: list[Block] = [
         Heading(2, f"{protocol}, {profile} profile"),
-        Paragraph(("Data: ", *_data(runs[0]), ". Protocol digest ", code(digest), ".")),
+        Paragraph(("Data: ", *data_words(runs[0]), ". Protocol digest ", code(digest), ".")),
     ]
     blocks += [
         Paragraph(f"Not done: {run.method} on {run.scene}: {run.status} ({run.record['reason']}).")
@@ -137,7 +137,8 @@ def _group(runs: list[RunResult], presets: Sequence[str], targets: Sequence[Targ
     return blocks + inpainting_section(labelled)
 
 
-def _data(run: RunResult) -> tuple[str | Span, ...]:
+def data_words(run: RunResult) -> tuple[str | Span, ...]:
+    """What a run was made on."""
     about = run.record["about"]
     if about["standin"]:
         return strong(about["standin"]), ": made by the bench, not real data"

@@ -3,12 +3,14 @@
 import csv
 import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from ihbench.body import load_body, position_map, texel_table
 from ihbench.document import diagram
+from ihbench.document.document import write
 from ihbench.errors import BadInput
 from ihbench.kernels import figure, metrics, position_maps, scoring, skinning, splats, table, zbuffers
 from ihbench.kernels.measuring import interleave, peak_mib, summary
@@ -23,7 +25,11 @@ def small(monkeypatch):
     monkeypatch.setitem(table.KERNELS, "zbuffer", lambda repeats: zbuffers.zbuffer_rows(repeats, (("tiny", 8, 32),)))
 
 
-def test_every_back_end_gets_a_row(small, capsys):
+def shown(rows):
+    return write(table.blocks_of(table.machine.identity(), rows), "terminal")
+
+
+def test_every_back_end_gets_a_row(small):
     rows = table.run_kernels(["splat", "zbuffer"], repeats=2)
     found = [(r["kernel"], r["case"], r["backend"]) for r in rows]
     assert found == [
@@ -39,16 +45,15 @@ def test_every_back_end_gets_a_row(small, capsys):
         assert (row["backward_ms"] is None) == (row["kernel"] == "zbuffer")
         assert row["value_error"] < 1e-5
         assert row["gradient_error"] is None or row["gradient_error"] < 1e-4
-    out = capsys.readouterr().out
+    out = shown(rows)
     assert "numba" in out
     assert "threads" in out
     assert "load" in out
 
 
-def test_json_is_one_object(small, capsys):
-    rows = table.run_kernels(["zbuffer"], as_json=True, repeats=1)
-    printed = json.loads(capsys.readouterr().out)
-    assert printed["rows"] == rows
+def test_json_is_one_object(small, bench):
+    printed = json.loads(bench("kernels", "zbuffer", "--repeats", "1", "--json").out)
+    assert [row["backend"] for row in printed["rows"]] == ["numpy", "numba"]
     assert printed["machine"]["cores_usable"] >= 1
 
 
@@ -190,23 +195,19 @@ def test_a_table_with_nothing_to_draw_is_still_written(tmp_path):
     assert diagram.round_ticks(1, 10)
 
 
-def test_a_kernel_that_a_method_registers_is_measured_beside_the_benchs_own(monkeypatch, capsys):
-    found = table.registry.names
-    monkeypatch.setattr(table.registry, "names", lambda kind: ["theirs"] if kind == "kernel" else found(kind))
-    monkeypatch.setattr(table.registry, "load", lambda kind, name: lambda repeats: [
-        a_row(kernel=name, backward_ms=None, backward_iqr_ms=None, peak_mib=None, gradient_error=None)
-    ])  # fmt: skip
+def test_a_kernel_that_a_method_registers_is_measured_beside_the_benchs_own(monkeypatch):
+    theirs = a_row(kernel="theirs", backward_ms=None, backward_iqr_ms=None, peak_mib=None, gradient_error=None)
+    spec = SimpleNamespace(kernels={"theirs": "module:rows"}, load=lambda where: lambda repeats: [theirs])
+    monkeypatch.setattr(table, "usable_specs", lambda: [spec])
     (row,) = table.run_kernels(["theirs"], repeats=1)
     assert row["kernel"] == "theirs"
-    assert "theirs" in capsys.readouterr().out
+    assert "theirs" in shown([row])
 
 
 @pytest.mark.parametrize(("load", "said"), [(9.0, True), (0.5, False)])
-def test_a_busy_machine_is_named_below_the_table(small, capsys, monkeypatch, load, said):
-    identity = table.machine.identity() | {"load_average": [load, 0.0, 0.0], "cores_usable": 2}
-    monkeypatch.setattr(table.machine, "identity", lambda: identity)
-    table.run_kernels(["zbuffer"], repeats=1)
-    assert ("times are unstable" in capsys.readouterr().out) == said
+def test_a_busy_machine_is_named_below_the_table(load, said):
+    about = table.machine.identity() | {"load_average": [load, 0.0, 0.0], "cores_usable": 2}
+    assert ("times are unstable" in write(table.blocks_of(about, []), "terminal")) == said
 
 
 def test_scoring_is_timed_on_a_stand_in(bench, monkeypatch):

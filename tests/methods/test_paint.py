@@ -8,6 +8,7 @@ import pytest
 
 from ihbench.diffusion.inpaint_config import FULL
 from ihbench.diffusion.mini.weights import save_mini
+from ihbench.document.document import write
 from ihbench.methods.inpainthuman.studies.paint_table import summary, table
 from tests.diffusion.tiny_diffusion import tiny_backbone
 
@@ -45,7 +46,7 @@ def test_the_table_has_intervals_and_the_full_methods_lead(painted):
     assert result["mean"]["psnr"]["mean"] == 10.5
     assert result["mean"]["lead"]["mean"] == pytest.approx(2)
     assert "lead" not in result[FULL]
-    assert "| mean | 10.50 (" in table(result, "two scenes")
+    assert "| mean | 10.50 (" in write(table(result, "two scenes"), "md")
     assert painted[1].joinpath("paint.md").read_text().count("\n| ") == 5
 
 

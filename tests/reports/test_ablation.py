@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from ihbench.document.markdown import write as markdown
 from ihbench.reports.general.ablation import write
 from ihbench.runner.ablation import Comparison, Ladder, Rung
 from tests.reports.made_up_runs import made_up
@@ -24,8 +25,8 @@ def told(runs, comparisons=(("step", "low", "high"),)):
         for rung, having in runs.items()
         for run in having
     ]
-    text, numbers = write(ladder, found)  # pyright: ignore
-    return text, numbers["tables"][0]
+    blocks, numbers = write(ladder, found)  # pyright: ignore
+    return markdown(blocks), numbers["tables"][0]
 
 
 def rung(tmp_path, psnr, scenes=SCENES, seeds=(0,), **more):
@@ -36,7 +37,7 @@ def test_a_difference_beyond_doubt_is_marked(tmp_path):
     text, table = told({"low": rung(tmp_path, 20), "high": rung(tmp_path, 22)})
     (row,) = table["comparisons"]
     assert row["scores"][IDENTITY]["mean"] == pytest.approx(2)
-    assert "| step | 6 | +2.00* [" in text
+    assert "| step | 6 | +2.00\\* [" in text
     assert "nothing can be marked" not in text
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +12,8 @@ import tyro
 
 from ihbench.bounds import Within
 from ihbench.commands.options.device import check_device
+from ihbench.commands.options.printing import Report
+from ihbench.document.document import Block, Heading, Table, write
 from ihbench.errors import BadInput
 from ihbench.methods.inpainthuman.spec import SPEC
 
@@ -23,7 +24,7 @@ REGIONS = ("hidden", "visible", "never_seen")
 
 
 @dataclass(frozen=True)
-class CeilingOptions:
+class CeilingOptions(Report):
     run: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
     """Folders of finished runs that painted."""
     truth: Annotated[tuple[float, ...], Within(0, 1, above=True)] = (0.5, 1.0)
@@ -36,8 +37,6 @@ class CeilingOptions:
     """Where to fit."""
     out: Path | None = None
     """Folder for `ceiling.md` and `ceiling.json`."""
-    json: bool = False
-    """Print one JSON object on stdout and nothing else there."""
 
 
 def main(argv: list[str]) -> int:
@@ -63,7 +62,8 @@ def _ceiling(chosen: CeilingOptions) -> int:
     groups = {result.group[:3] for result in results}
     if len(groups) > 1:
         raise BadInput(f"ceiling: runs of one protocol and profile at a time, got {sorted(map(str, groups))}")
-    progress, found, text = Progress(), [], ""
+    progress, found = Progress(), []
+    blocks: list[Block] = []
     numbers: dict[str, Any] = {}
     for result in results:
         shares = tuple(sorted(set(chosen.truth)))
@@ -75,11 +75,11 @@ def _ceiling(chosen: CeilingOptions) -> int:
         runs = [_numbers(r, its_rows) for r, (_, its_rows) in zip(results, found, strict=False)]
         title = _title(results[: len(found)])
         numbers = {"title": title, "runs": runs}
-        text = table(found, title)
+        blocks = table(found, title)
         if chosen.out is not None:  # after every run: the next may take minutes
-            outputs.write_text(chosen.out / "ceiling.md", text + "\n")
+            outputs.write_text(chosen.out / "ceiling.md", write(blocks, "md"))
             outputs.write_json(chosen.out / "ceiling.json", numbers)
-    print(json.dumps(numbers, allow_nan=False) if chosen.json else text)
+    chosen.show(numbers, blocks)
     return 0
 
 
@@ -88,12 +88,11 @@ def _title(results: Sequence[Any]) -> str:
     return f"{results[0].identity['protocol']}, {len(results)} runs of {scenes} scenes, {results[0].data}"
 
 
-def table(found: Sequence[tuple[str, Sequence[CeilingRow]]], title: str) -> str:
-    """Markdown: a row for each painting, means over scenes, differences to stage 1 paired over scenes."""
+def table(found: Sequence[tuple[str, Sequence[CeilingRow]]], title: str) -> list[Block]:
+    """A row for each painting, means over scenes, differences to stage 1 paired over scenes."""
     regions = [region for region in REGIONS if any(math.isfinite(_mean(rows[0], region)) for _, rows in found)]
-    heads = [f"PSNR {region} ↑ | over stage 1" for region in regions]
-    lines = [f"### What a better painter would give: {title}", ""]
-    lines += [f"| paintings | their PSNR ↑ | {' | '.join(heads)} |", "|---|---:|" + "---:|---|" * len(regions)]
+    heads = [text for region in regions for text in (f"PSNR {region} ↑", "over stage 1")]
+    lines = []
     for k, row in enumerate(found[0][1]):
         quality = _average([(scene, rows[k].painted_psnr) for scene, rows in found])
         cells = [_decibels(_over_scenes(quality))]
@@ -101,8 +100,11 @@ def table(found: Sequence[tuple[str, Sequence[CeilingRow]]], title: str) -> str:
             own = _average([(scene, _mean(rows[k], region)) for scene, rows in found])
             first = _average([(scene, _mean(rows[0], region)) for scene, rows in found])
             cells += [_decibels(_over_scenes(own)), "" if row.truth is None else _gain(own, first)]
-        lines.append(f"| {row.name} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        lines.append((row.name, *cells))
+    return [
+        Heading(3, f"What a better painter would give: {title}"),
+        Table(("paintings", "their PSNR ↑", *heads), tuple(lines)),
+    ]
 
 
 def _mean(row: CeilingRow, region: str) -> float:

@@ -5,13 +5,13 @@ For scenes whose truth is known behind the occluder: stand-ins, and captures und
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from ihbench.bounds import SEEDS, Within, refuse_repeated
 from ihbench.commands.options.device import check_device
+from ihbench.commands.options.printing import Report
 from ihbench.commands.options.scene_choice import ProtocolChanges
 from ihbench.diffusion.inpaint_config import COMPONENTS, SIMPLE, InpaintConfig
 from ihbench.errors import BadInput
@@ -20,7 +20,7 @@ ROWS = (*SIMPLE, *COMPONENTS)
 
 
 @dataclass(frozen=True, kw_only=True)
-class PaintOptions(ProtocolChanges):
+class PaintOptions(ProtocolChanges, Report):
     protocol: str = "people_snapshot_occ"
     """A registered protocol (`ihbench list protocols`), or the path of a protocol file of your own (.toml)."""
     scene: tuple[str, ...] = ()
@@ -43,8 +43,6 @@ class PaintOptions(ProtocolChanges):
     """Folder for `paint.json`, the table and a picture per scene."""
     inpaint: InpaintConfig = field(default_factory=InpaintConfig)
     """How diffusion is personalised and sampled."""
-    json: bool = False
-    """Print one JSON object on stdout and nothing else there."""
 
 
 def main(argv: list[str]) -> int:
@@ -57,6 +55,7 @@ def main(argv: list[str]) -> int:
 def _paint(chosen: Any) -> int:
     from ihbench import registry
     from ihbench.clock.progress import Progress
+    from ihbench.document.document import write
     from ihbench.files.pictures import encoded
     from ihbench.methods.inpainthuman.studies.paint_table import paint_scene, summary, table
     from ihbench.record import outputs
@@ -96,8 +95,8 @@ def _paint(chosen: Any) -> int:
             outputs.write_bytes(chosen.out / f"{scene}.png", encoded(picture, "PNG"))
             outputs.write_json(chosen.out / "paint.json", {"scenes": scenes, "summary": summary(scenes)})
     result = summary(scenes)
-    text = table(result, f"{protocols[0].name}, {len(scenes)} scenes, {data}")
+    blocks = table(result, f"{protocols[0].name}, {len(scenes)} scenes, {data}")
     if chosen.out is not None:
-        outputs.write_text(chosen.out / "paint.md", text + "\n")
-    print(json.dumps({"scenes": scenes, "summary": result}) if chosen.json else text)
+        outputs.write_text(chosen.out / "paint.md", write(blocks, "md"))
+    chosen.show({"scenes": scenes, "summary": result}, blocks)
     return 0

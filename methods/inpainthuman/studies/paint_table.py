@@ -15,6 +15,7 @@ from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.diffusion.crops.crop_view import CropView, cut_view
 from ihbench.diffusion.inpaint_config import COMPONENTS, FULL, SIMPLE, InpaintConfig
+from ihbench.document.document import Block, Heading, Table
 from ihbench.errors import BadInput
 from ihbench.metrics.statistics import mean_interval, paired_test
 from ihbench.scene.contracts import Capture
@@ -141,23 +142,18 @@ def summary(scenes: Mapping[str, Mapping[str, Mapping[str, float]]]) -> dict[str
     return out
 
 
-def table(result: Mapping[str, Any], title: str) -> str:
-    """Markdown."""
-    lines = [
-        f"### Hidden person pixels: {title}",
-        "",
-        "| painter | PSNR ↑ (95 %) | on the body model ↑ | SSIM ↑ | FLIP ↓ | drift ΔE ↓ | flicker ↓ | s "
-        f"| {FULL} leads by |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+def table(result: Mapping[str, Any], title: str) -> list[Block]:
+    """A row for each painter."""
+    head = ("painter", "PSNR ↑ (95 %)", "on the body model ↑", "SSIM ↑", "FLIP ↓", "drift ΔE ↓", "flicker ↓", "s")
+    rows = []
     for row, scores in result.items():
         cells = [
             _told(scores.get("psnr"), 2, True), _told(scores.get("psnr_on_body"), 2), _told(scores.get("ssim"), 3),
             _told(scores.get("flip"), 3), _told(scores.get("delta_e"), 1), _told(scores.get("flicker"), 3),
             _told(scores.get("seconds"), 0), _told(scores.get("lead"), 2, True),
         ]  # fmt: skip
-        lines.append(f"| {row} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        rows.append((row, *cells))
+    return [Heading(3, f"Hidden person pixels: {title}"), Table((*head, f"{FULL} leads by"), tuple(rows))]
 
 
 def _told(score: Mapping[str, float] | None, digits: int, interval: bool = False) -> str:
