@@ -49,7 +49,7 @@ def main(argv: list[str]) -> int:
     head = [{"used_by": "used by", "size_mb": "MB"}.get(key, key) for key in keys]
     rows = tuple(tuple(str(state[key]) for key in keys) for state in states)
     searched = [Paragraph(f"searched: {folder}") for folder in folders if where]
-    chosen.show({"folders": folders, "weights": states}, [*searched, Table(tuple(head), rows, left=4, bare=True)])
+    chosen.show({"folders": folders, "weights": states}, [*searched, Table(tuple(head), rows, left=4)])
     return 1 if any(s["state"] == "damaged" for s in states) else 0
 
 

@@ -26,7 +26,8 @@ def write(blocks: Sequence[Block], folder: Path = Path("."), styled: bool = Fals
     )
     before: Block | None = None
     for block in blocks:
-        if before is not None and (isinstance(block, Heading) or isinstance(before, Table)):
+        begins = isinstance(block, Heading) or (isinstance(block, Table) and bool(block.title))
+        if before is not None and (begins or isinstance(before, Table)):
             console.print()
         for line in _lines(block, before):
             text = Text()
@@ -80,5 +81,7 @@ def _table(table: Table) -> Iterator[Line]:
 
 
 def _styled(words: Cell) -> Line:
-    pieces = spans(words)
-    return [(p, "") if isinstance(p, str) else (p.text, STYLES.get(p.style, "")) for p in pieces]
+    return [
+        (p, "") if isinstance(p, str) else (f"({p.text})" if p.style == "raised" else p.text, STYLES.get(p.style, ""))
+        for p in spans(words)
+    ]

@@ -78,14 +78,12 @@ def written(frame: Frame, form: str, fragment: bool = False) -> str:
     """The table in a format. Raises `BadInput` for a fragment of what is none."""
     from ihbench.document import csv, document
 
-    if form not in ("csv", "json"):
-        return (
-            document.write_fragment([*frame.tables, *frame.below], form)
-            if fragment
-            else document.write(frame.blocks, form)
-        )
-    if fragment:
+    if fragment and form not in ("md", "tex", "html"):
         raise BadInput(f"--fragment: {form} has no document around it; leave it out, or take tex, md or html")
+    if fragment:
+        return document.write_fragment([*frame.tables, *frame.below], form)
+    if form not in ("csv", "json"):
+        return document.write(frame.blocks, form)
     if form == "csv":
         return csv.write_cells({"table": frame.name}, frame.tables, frame.footnotes)
     content = {

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from ihbench.document import csv, diagram, html, latex, markdown
+from ihbench.document import csv, diagram, html, latex, markdown, terminal
 from ihbench.document.document import Bullets, Heading, Paragraph, Table, code, strong
 from ihbench.errors import BadInput, Diverged
 from ihbench.reports.general import report
@@ -128,13 +128,18 @@ def test_latex_tables_are_booktabs_with_as_many_cells_as_columns(tmp_path):
         assert {len(re.split(r"(?<!\\)&", row)) for row in rows} == {len(columns)}
 
 
-def test_the_three_say_the_same_numbers(tmp_path):
+def test_all_say_the_same_numbers(tmp_path):
     runs = [made_up(tmp_path, s, psnr=p) for s, p in (("a", 23.456), ("b", 27.891))]
     found = [
         sorted(re.findall(r"\d+\.\d{2,4}(?!\d)", re.sub(r"<style>.*?</style>|src=\"[^\"]*\"", "", text, flags=re.S)))
-        for text in (report.MARKDOWN(runs), report.LATEX(runs), html.write(general_report(runs)))
+        for text in (
+            report.MARKDOWN(runs),
+            report.LATEX(runs),
+            html.write(general_report(runs)),
+            terminal.write(general_report(runs)),
+        )
     ]
-    assert found[0] == found[1] == found[2]
+    assert all(numbers == found[0] for numbers in found)
     assert "25.67" in found[0]
 
 
@@ -167,11 +172,7 @@ def test_markdown_of_any_name_shows_it_and_links_nothing(text):
     assert [unescape(cell) for cell in cells] == [text] * 4
 
 
-def csv_cell(_):
-    return csv.harmless(UNSEEN)
-
-
-@pytest.mark.parametrize("write", [markdown.write, latex.write, html.write, csv_cell])
+@pytest.mark.parametrize("write", [markdown.write, latex.write, html.write, csv.write, terminal.write])
 def test_unseen_characters_reach_no_report(write):
     text = write(
         [Heading(2, UNSEEN), Paragraph((UNSEEN, strong(UNSEEN), code(UNSEEN))), Table((UNSEEN,), ((UNSEEN,),))]
