@@ -65,8 +65,11 @@ def strip_generic(request: OcclusionRequest) -> Occlusion:
     return _strip("strip-generic", mid, width, request)
 
 
-def _narrowest_band(counts: NDArray[np.integer], fraction: float) -> tuple[int, int]:
-    """(mid, even width) of the narrowest band around the mean position that holds this share of the counts [n]."""
+def _narrowest_band(
+    counts: NDArray[np.integer],  # [n] person pixels of each column
+    fraction: float,
+) -> tuple[int, int]:
+    """(mid, even width), px, of the narrowest band around the mean column that holds this share of the counts."""
     total, n = int(counts.sum()), len(counts)
     mid = round(float((np.arange(n) * counts).sum() / total))
     below = np.concatenate([[0], np.cumsum(counts)])
@@ -90,7 +93,7 @@ def central_band(request: OcclusionRequest) -> Occlusion:
     """A full-height band that follows the person: centred on their mean column in every frame, as wide as it must be
     (smallest even width) to hide at least `fraction` of the frame's person pixels."""
 
-    def hidden(frame: int, person: Mask) -> Mask:
+    def hidden(frame: int, person: Mask) -> Mask:  # [H, W] both, original image
         mid, width = _narrowest_band(person.sum(0), request.rule.fraction)
         columns = np.zeros(request.width, bool)
         columns[max(0, mid - width // 2) : mid + width // 2] = True
@@ -102,7 +105,7 @@ def central_band(request: OcclusionRequest) -> Occlusion:
 def side(request: OcclusionRequest) -> Occlusion:
     """Everything left of a column, in every frame the one that hides at least `fraction` of the person."""
 
-    def hidden(frame: int, person: Mask) -> Mask:
+    def hidden(frame: int, person: Mask) -> Mask:  # [H, W] both, original image
         stop = _first_share(person.sum(0), request.rule.fraction)
         return np.broadcast_to(np.arange(request.width) < stop, person.shape)
 
@@ -113,7 +116,7 @@ def upper_half(request: OcclusionRequest) -> Occlusion:
     """Everything above a row, in every frame the one that hides at least `fraction` of the person (a half by
     default)."""
 
-    def hidden(frame: int, person: Mask) -> Mask:
+    def hidden(frame: int, person: Mask) -> Mask:  # [H, W] both, original image
         stop = _first_share(person.sum(1), request.rule.fraction)
         return np.broadcast_to((np.arange(request.height) < stop)[:, None], person.shape)
 
@@ -123,7 +126,7 @@ def upper_half(request: OcclusionRequest) -> Occlusion:
 def lower_half(request: OcclusionRequest) -> Occlusion:
     """Everything below a row, as a table before the person; in every frame at least `fraction` of them."""
 
-    def hidden(frame: int, person: Mask) -> Mask:
+    def hidden(frame: int, person: Mask) -> Mask:  # [H, W] both, original image
         stop = _first_share(person.sum(1)[::-1], request.rule.fraction)
         return np.broadcast_to((np.arange(request.height) >= request.height - stop)[:, None], person.shape)
 
@@ -134,7 +137,7 @@ def blocks(request: OcclusionRequest) -> Occlusion:
     """Random square blocks, a twelfth of the person's longer side each, until at least `fraction` of the frame's
     person is hidden. The last block is cut to what is still wanted."""
 
-    def hidden(frame: int, person: Mask) -> Mask:
+    def hidden(frame: int, person: Mask) -> Mask:  # [H, W] both, original image
         rows, columns = np.nonzero(person)
         block = max(1, max(np.ptp(rows), np.ptp(columns)) // BLOCKS_ACROSS)
         cell = (np.arange(request.height) // block)[:, None] * request.width + np.arange(request.width) // block
@@ -164,7 +167,7 @@ def pasted_object(request: OcclusionRequest) -> Occlusion:
     start, drift = seed.uniform(0, 2 * np.pi), seed.uniform(0.5, 1.5)
     last = max(request.covered_frames, default=0) + 1
 
-    def hidden(frame: int, person: Mask) -> Mask:
+    def hidden(frame: int, person: Mask) -> Mask:  # [H, W] both, original image
         rows, columns = np.nonzero(person)
         turn = start + drift * 2 * np.pi * frame / last
         x = columns.mean() + 0.25 * np.ptp(columns) * np.cos(turn)
@@ -192,7 +195,11 @@ def natural(request: OcclusionRequest) -> Occlusion:
     return Occlusion("natural", hidden, {})
 
 
-def _per_frame(rule: str, request: OcclusionRequest, hidden: Callable[[int, Mask], Mask]) -> Occlusion:
+def _per_frame(
+    rule: str,
+    request: OcclusionRequest,
+    hidden: Callable[[int, Mask], Mask],  # raw frame number, person [H, W] -> [H, W], original image
+) -> Occlusion:
     """A rule that looks at each frame by itself; a frame without anybody hides nothing."""
 
     def of(frame: int) -> Mask:
@@ -205,8 +212,11 @@ def _per_frame(rule: str, request: OcclusionRequest, hidden: Callable[[int, Mask
     return Occlusion(rule, of, record)
 
 
-def _first_share(counts: NDArray[np.integer], fraction: float) -> int:
-    """How many leading entries of counts [n] hold at least this share of them."""
+def _first_share(
+    counts: NDArray[np.integer],  # [n] person pixels of each column or row
+    fraction: float,
+) -> int:
+    """How many leading entries hold at least this share of the counts."""
     held = np.concatenate([[0], np.cumsum(counts)])
     return int(np.searchsorted(held, fraction * held[-1], side="left"))
 
