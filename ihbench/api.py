@@ -1,7 +1,7 @@
 """The commands as functions: `ihbench.run`, `load_scene`, `ablate` and `score`, with the command line's own checks.
 
-What is given is held against the types and bounds of the commands' options (`ihbench.bounds`), after numpy's numbers
-have become Python's and lists tuples. Whatever does not fit is one `BadInput`, before anything is read or written.
+What is given is held against the types and bounds of the commands' options, after numpy's numbers have
+become Python's and lists tuples. Whatever does not fit is one `BadInput`, before anything is read or written.
 """
 
 from __future__ import annotations
@@ -14,13 +14,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 
-from ihbench import bounds, registry
-from ihbench.bounds import SEEDS
+from ihbench import registry
 from ihbench.clock.progress import Progress
 from ihbench.commands.options.device import check_device
 from ihbench.commands.options.keep import check_keep
 from ihbench.commands.options.scene_choice import NO_CHOICE, OcclusionChoice, ProtocolChanges
-from ihbench.config_fields import replaced
+from ihbench.config_fields import SEEDS, check, replaced, shown
 from ihbench.errors import BadInput
 from ihbench.files.paths import user_path
 from ihbench.record.results import RunResult
@@ -94,9 +93,7 @@ def run(
     """
     for name, value in (("scene", scene), ("seed", seed)):
         if isinstance(value, list | tuple | set | range | np.ndarray) and np.ndim(list(value)):
-            raise BadInput(
-                f"{name} {bounds.shown(value)}: expected one; call ihbench.run for each, or ihbench.ablate"
-            )
+            raise BadInput(f"{name} {shown(value)}: expected one; call ihbench.run for each, or ihbench.ablate")
     given = _given(
         _RunArguments,
         dict(protocol=protocol, scene=scene, method=method, profile=profile, data=data, runs=runs, body=body,
@@ -194,7 +191,7 @@ def ablate(
     grids = {} if vary is None else vary
     for name, value in (("vary", grids), ("switches", switches or {})):
         if not isinstance(value, Mapping):
-            raise BadInput(f"{name} {bounds.shown(value)}: expected a mapping from switches to values")
+            raise BadInput(f"{name} {shown(value)}: expected a mapping from switches to values")
     values = {name: _several(value) for name, value in grids.items()}
     given = _given(
         AblateOptions,
@@ -265,22 +262,20 @@ def _given(
             value = user_path(value, name) if "Path" in known[name] else os.fspath(value)
         values[name] = value
     given = kind(**values, occlusion=_occlusion(occlusion), choices=_choices(choices))
-    bounds.check(given, "")
+    check(given, "")
     return given
 
 
 def _progress(progress: Any) -> Progress:
     if progress is not None and not isinstance(progress, Progress):
-        raise BadInput(f"progress {bounds.shown(progress)}: expected an ihbench.clock.progress.Progress, or None")
+        raise BadInput(f"progress {shown(progress)}: expected an ihbench.clock.progress.Progress, or None")
     return Progress() if progress is None else progress
 
 
 def _occlusion(value: Occlusion) -> OcclusionChoice:
     given = {"rule": value} if isinstance(value, str) else {} if value is None else value
     if not isinstance(given, Mapping):
-        raise BadInput(
-            f"occlusion {bounds.shown(value)}: expected a rule's name, or a mapping of rule, fraction, covers"
-        )
+        raise BadInput(f"occlusion {shown(value)}: expected a rule's name, or a mapping of rule, fraction, covers")
     known = [f.name for f in fields(OcclusionChoice)]
     for name in given:
         if name not in known:
@@ -288,14 +283,14 @@ def _occlusion(value: Occlusion) -> OcclusionChoice:
     plain = {name: _plain(part) for name, part in given.items()}
     fraction = plain.get("fraction")
     if isinstance(fraction, tuple):
-        raise BadInput(f"occlusion.fraction {bounds.shown(fraction)}: expected one number; call once for each")
+        raise BadInput(f"occlusion.fraction {shown(fraction)}: expected one number; call once for each")
     return OcclusionChoice(plain.get("rule"), () if fraction is None else (fraction,), plain.get("covers"))
 
 
 def _choices(value: Choices) -> Any:
     given = {} if value is None else value
     if not isinstance(given, Mapping):
-        raise BadInput(f"choices {bounds.shown(value)}: expected a mapping from a protocol's choices to their values")
+        raise BadInput(f"choices {shown(value)}: expected a mapping from a protocol's choices to their values")
     for name in given:
         if name not in CHOICES:
             raise BadInput(f"choices {name!r}: {registry.nearest(str(name), list(CHOICES))}")

@@ -10,9 +10,9 @@ from typing import Annotated, Any
 import tyro
 
 from ihbench import registry
-from ihbench.bounds import LARGEST_CAST, SEEDS, Within
 from ihbench.commands.options.parse import options
 from ihbench.commands.options.printing import Printing
+from ihbench.config_fields import LARGEST_CAST, SEEDS, Within
 from ihbench.document.document import Block, Heading, Table
 from ihbench.errors import BadInput
 

@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from ihbench.bounds import WHOLE, whole
 from ihbench.commands.options.parse import options
+from ihbench.config_fields import WHOLE, whole
 from ihbench.errors import BadInput
 from ihbench.version import __version__
 

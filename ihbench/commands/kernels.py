@@ -9,9 +9,9 @@ from typing import Annotated
 
 import tyro
 
-from ihbench.bounds import Within
 from ihbench.commands.options.parse import options
 from ihbench.commands.options.printing import Printing
+from ihbench.config_fields import Within
 
 
 @dataclass(frozen=True)

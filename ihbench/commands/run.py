@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from ihbench import registry
-from ihbench.bounds import SEEDS, refuse_repeated
 from ihbench.commands.options.device import check_device
 from ihbench.commands.options.keep import check_keep
 from ihbench.commands.options.parse import options
 from ihbench.commands.options.scene_choice import SceneChoice
 from ihbench.commands.report import headline
+from ihbench.config_fields import SEEDS, refuse_repeated
 from ihbench.errors import BadInput
 from ihbench.scene.method_spec import method_spec
 

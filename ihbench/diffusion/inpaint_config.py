@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, get_args
 
-from ihbench.bounds import STEPS, Within, check
+from ihbench.config_fields import STEPS, Within, check
 from ihbench.errors import BadInput
 
 TOKEN = "<someone>"

@@ -10,8 +10,7 @@ from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Any
 
-from ihbench.bounds import refuse_repeated
-from ihbench.config_fields import flat, with_fields
+from ihbench.config_fields import flat, refuse_repeated, with_fields
 from ihbench.errors import BadInput
 
 GRID = "grid"

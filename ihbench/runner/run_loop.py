@@ -18,12 +18,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench import bounds, registry
-from ihbench.bounds import SEEDS
+from ihbench import config_fields, registry
 from ihbench.clock import machine
 from ihbench.clock.events import Event, Reused
 from ihbench.clock.progress import Progress
-from ihbench.config_fields import flat, with_fields
+from ihbench.config_fields import SEEDS, flat, with_fields
 from ihbench.errors import BadInput
 from ihbench.metrics import mean_over_frames
 from ihbench.record.provenance import command
@@ -66,7 +65,7 @@ class RunRequest:
     command: tuple[str, ...] = dataclass_field(default_factory=command)  # for the record only
 
     def __post_init__(self) -> None:
-        bounds.check(self, "", ("seed", "device", "runs", "force", "keep", "share"))
+        config_fields.check(self, "", ("seed", "device", "runs", "force", "keep", "share"))
 
 
 def configuration(method: str, profile: str, switches: dict[str, Any]) -> Any:

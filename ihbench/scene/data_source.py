@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 from ihbench import registry
 from ihbench.body import Body, load_body
-from ihbench.bounds import LARGEST_CAST, refuse_repeated
 from ihbench.clock.progress import Progress
+from ihbench.config_fields import LARGEST_CAST, refuse_repeated
 from ihbench.errors import BadInput
 from ihbench.files.paths import cache_folder, path_from, user_path
 from ihbench.scene.contracts import Capture, Dataset

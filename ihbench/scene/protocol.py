@@ -15,8 +15,19 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from ihbench import registry
-from ihbench.bounds import IMAGE_SIZES, Within, whole
-from ihbench.config_fields import Entries, Name, Text, as_table, flat, hints, read, replaced
+from ihbench.config_fields import (
+    IMAGE_SIZES,
+    Entries,
+    Name,
+    Text,
+    Within,
+    as_table,
+    flat,
+    hints,
+    read,
+    replaced,
+    whole,
+)
 from ihbench.errors import BadInput
 from ihbench.files.regular import read_toml
 

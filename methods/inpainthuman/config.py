@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-from ihbench.bounds import STEPS, MultipleOf, Within, check
+from ihbench.config_fields import STEPS, MultipleOf, Within, check
 from ihbench.diffusion.inpaint_config import PAPER_INPAINT, QUICK_INPAINT, InpaintConfig
 from ihbench.errors import BadInput
 from ihbench.methods.inpainthuman.refine_config import PAPER_REFINE, QUICK_REFINE, RefineConfig

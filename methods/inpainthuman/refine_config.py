@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from ihbench.bounds import STEPS, Within, check
+from ihbench.config_fields import STEPS, Within, check
 
 WEIGHT = Within(0, 1e6)  # of a term of the loss
 

@@ -13,7 +13,6 @@ BELOW = (
     "version",
     "errors",
     "registry",
-    "bounds",
     "camera",
     "config_fields",
 )  # of the root, what every storey may use

@@ -10,7 +10,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from ihbench import bounds
+from ihbench import config_fields
 from ihbench.cli import main
 from ihbench.clock.progress import Progress
 from ihbench.clock.threads import one_torch_thread
@@ -34,7 +34,7 @@ SIDE = 64  # px
 
 def without_bounds(patch: pytest.MonkeyPatch) -> None:
     """Two people are fewer than anybody may ask for."""
-    for bound in (bounds.Within, bounds.MultipleOf):
+    for bound in (config_fields.Within, config_fields.MultipleOf):
         patch.setattr(bound, "holds", lambda self, number: True)
 
 

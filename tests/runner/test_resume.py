@@ -7,7 +7,7 @@ from textwrap import dedent
 
 import pytest
 
-from ihbench import bounds
+from ihbench import config_fields
 from ihbench.clock.ledger import Ledger
 from ihbench.files.atomic import read_json, read_json_lines
 from tests.conftest import contents
@@ -163,7 +163,7 @@ def assert_diverged(bench, outcome, step):
 def test_an_absurd_step_size_is_a_divergence_even_when_the_curve_is_measured_there(bench, monkeypatch, switch):
     due = Ledger.offer
     monkeypatch.setattr(Ledger, "offer", lambda self, *a, force=False: due(self, *a, force=True))
-    monkeypatch.setattr(bounds.Within, "holds", lambda *_: True)  # nobody may ask for so much
+    monkeypatch.setattr(config_fields.Within, "holds", lambda *_: True)  # nobody may ask for so much
     outcome = bench.run(switch, "1e30")
     assert_diverged(bench, outcome, events(bench, "diverged")[0]["step"])
     assert 1 <= events(bench, "diverged")[0]["step"] < LAST

@@ -10,7 +10,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from ihbench import bounds
+from ihbench import config_fields
 from ihbench.clock import streams
 from ihbench.errors import BadInput
 from ihbench.files.paths import user_path
@@ -34,7 +34,7 @@ SHELLS = ("bash", "zsh", "tcsh")
 def options(kind: type[Options], argv: list[str], command: str, description: str) -> Options:
     """Parse `argv` with tyro, whose help goes to stdout with status 0.
 
-    Raises `BadInput` for what cannot be parsed, numbers out of bounds (`ihbench.bounds`) and paths that cannot be.
+    Raises `BadInput` for what cannot be parsed, numbers out of bounds and paths that cannot be.
     """
     import tyro
 
@@ -54,7 +54,7 @@ def options(kind: type[Options], argv: list[str], command: str, description: str
             raise
         raise BadInput(f"{_in_one_line(complaint.getvalue())}; see ihbench {command} --help") from end
     _refuse_empty(chosen, argv)
-    bounds.check(chosen)
+    config_fields.check(chosen)
     return chosen
 
 
@@ -84,9 +84,9 @@ def _spelling() -> ConstructorRegistry:
     from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
     readers: dict[type, tuple[str, Callable[[str], Any], type | tuple[type, ...]]] = {
-        int: ("INT", bounds.whole, int),
-        float: ("FLOAT", bounds.real, (int, float)),
-        str: ("STR", bounds.plain, str),
+        int: ("INT", config_fields.whole, int),
+        float: ("FLOAT", config_fields.real, (int, float)),
+        str: ("STR", config_fields.plain, str),
         Path: ("PATH", _path, Path),
     }
     rules = ConstructorRegistry()

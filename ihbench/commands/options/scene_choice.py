@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Union, get_args, get_origin, g
 
 import tyro
 
-from ihbench.bounds import IMAGE_SIZES, Within, refuse_repeated
-from ihbench.config_fields import flat, has_text
+from ihbench.config_fields import IMAGE_SIZES, Within, flat, has_text, refuse_repeated
 from ihbench.errors import BadInput
 from ihbench.scene import protocol as protocol_module
 from ihbench.scene.protocol import CHOICES, Protocol, ProtocolFile

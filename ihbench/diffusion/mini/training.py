@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from ihbench.bounds import SEEDS, STEPS, MultipleOf, Within, check
+from ihbench.config_fields import SEEDS, STEPS, MultipleOf, Within, check
 
 
 @dataclass(frozen=True)

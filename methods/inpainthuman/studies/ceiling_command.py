@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from ihbench.bounds import Within
 from ihbench.commands.options.device import check_device
 from ihbench.commands.options.printing import Report
+from ihbench.config_fields import Within
 from ihbench.document.document import Block, Heading, Table, write
 from ihbench.errors import BadInput
 from ihbench.methods.inpainthuman.spec import SPEC

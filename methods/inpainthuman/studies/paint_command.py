@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from ihbench.bounds import SEEDS, Within, refuse_repeated
 from ihbench.commands.options.device import check_device
 from ihbench.commands.options.printing import Report
 from ihbench.commands.options.scene_choice import ProtocolChanges
+from ihbench.config_fields import SEEDS, Within, refuse_repeated
 from ihbench.diffusion.inpaint_config import COMPONENTS, SIMPLE, InpaintConfig
 from ihbench.errors import BadInput
 
