@@ -77,7 +77,7 @@ class RunResult:
         """What the run was made on, as a table names it."""
         about = self.record["about"]
         if about["standin"]:
-            return f"**{about['standin']}**: made by the bench, not real data"
+            return f"{about['standin']}: made by the bench, not real data"
         return f"real data ({about['variant']})"
 
 

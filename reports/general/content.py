@@ -74,7 +74,7 @@ def score_tables(results: Sequence[RunResult], presets: Sequence[str] = ()) -> l
     found: list[Table] = []
     for (protocol, digest, profile, data), runs in groups.items():
         headline = runs[0].record["about"]["headline"]
-        title = f"{protocol} ({digest}), {profile} profile, {data.replace('*', '')}"
+        title = f"{protocol} ({digest}), {profile} profile, {data}"
         columns = [i for i in dict.fromkeys(i for r in runs for i in r.rows[r.method]) if _has_a_number(runs, i)]
         if columns:
             table = _table(runs, [run.rows for run in runs], columns, headline, with_metric=True)

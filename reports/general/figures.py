@@ -62,13 +62,12 @@ def draw(results: Sequence[RunResult], folder: Path) -> list[tuple[Path, str]]:
         configs = configurations(runs)
         headline = runs[0].record["about"]["headline"]
         title = f"{protocol}, {profile} profile"
-        about = data.replace("*", "")
-        drawn += _work_precision(configs, headline, folder / f"work-precision_{name}", title, about)
-        drawn += _quality_time(configs, headline, folder / f"quality-time_{name}", title, about)
+        drawn += _work_precision(configs, headline, folder / f"work-precision_{name}", title, data)
+        drawn += _quality_time(configs, headline, folder / f"quality-time_{name}", title, data)
     for (protocol, data), runs in same_protocol(results).items():
         name = _new(f"{plain_name(protocol)}_profiles-and-sizes", "", names)
         headline = runs[0].record["about"]["headline"]
-        about = f"{data.replace('*', '')}; test images differ in size: compare errors with care"
+        about = f"{data}; test images differ in size: compare errors with care"
         configs = configurations(runs, across=True)
         title = f"{protocol}: profiles and image sizes"
         drawn += _work_precision(configs, headline, folder / f"work-precision_{name}", title, about)

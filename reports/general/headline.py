@@ -55,7 +55,7 @@ def write(results: Sequence[RunResult], left_out: Sequence[str] = (), width: int
 
 def _group(runs: Sequence[RunResult], width: int) -> list[str]:
     protocol, _, profile, data = runs[0].group
-    title = _wrapped(f"{protocol}, {profile} profile, {data.replace('*', '')}", width)
+    title = _wrapped(f"{protocol}, {profile} profile, {data}", width)
     done = [run for run in runs if run.status == "done"]
     if not done:
         return title

@@ -399,7 +399,7 @@ def _about(
     seeds = sorted({run.identity["seed"] for run in done})
     views = f", views of training ({group.views})" if group.views else ""
     notes = [
-        f"{group.name}: {protocol} (digest {digest}), {data.replace('*', '')}; region {region or 'none'}{views}; "
+        f"{group.name}: {protocol} (digest {digest}), {data}; region {region or 'none'}{views}; "
         f"{counted} ({', '.join(scenes) or 'none'}); seeds {', '.join(map(str, seeds)) or 'none'}."
     ]
     known = [identity for identity in identities if identity]
