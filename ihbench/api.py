@@ -235,7 +235,7 @@ def score(
 ) -> list[RunResult]:
     """Score a folder of images that somebody else's code rendered, as `ihbench score` does: a result for each scene.
 
-    What is missing or doubtful stands in `result.record["about"]["predictions"]`, and `progress` says it. Raises
+    What is missing or doubtful stands in `result.about.predictions`, and `progress` says it. Raises
     `BadInput` for anything the caller got wrong.
     """
     from ihbench.commands.score import ScoreOptions, scored

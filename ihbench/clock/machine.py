@@ -9,45 +9,64 @@ import os
 import platform
 import sys
 import warnings
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated
+
+from ihbench.files.shape import Within
+
+Cores = Annotated[int, Within(1, 1e6)]
+Loads = tuple[Annotated[float, Within(0)], ...]
 
 BUSY = 1.5  # load average per usable core above which other work was in the way: one run alone brings about 1
 
 
-def identity() -> dict[str, Any]:
+@dataclass(frozen=True)
+class Machine:
     """Processor, cores, memory, Python, torch and load: what somebody needs to judge a time in seconds.
 
     Host names and user names are left out: run folders are shared.
     """
+
+    cpu: str | None = None
+    cores: Cores | None = None
+    cores_usable: Cores | None = None
+    memory_gb: float | None = None  # GiB
+    platform: str | None = None
+    python: str | None = None
+    torch: str | None = None  # version; None before it was imported
+    torch_threads: Cores | None = None
+    gpu: str | None = None
+    load_average: Loads | None = None  # at the beginning, which the run itself has no part in
+    load_average_end: Loads | None = None
+
+    def at_end(self) -> Machine:
+        """The identity as it is known when torch and the device have been used, with the load of both moments."""
+        now = identity()
+        return replace(now, load_average=self.load_average, load_average_end=now.load_average)
+
+
+def identity() -> Machine:
+    """The machine that this process runs on."""
     torch = sys.modules.get("torch")
-    return {
-        "cpu": cpu_model(),
-        "cores": os.cpu_count() or 1,
-        "cores_usable": usable_cores(),
-        "memory_gb": memory_gb(),
-        "platform": platform.platform(),
-        "python": platform.python_version(),
-        "torch": str(torch.__version__) if torch is not None else None,
-        "torch_threads": torch.get_num_threads() if torch is not None else None,
-        "gpu": sys.modules["torch"].cuda.get_device_name() if _cuda_in_use() else None,
-        "load_average": load_average(),
-    }
+    return Machine(
+        cpu=cpu_model(),
+        cores=os.cpu_count() or 1,
+        cores_usable=usable_cores(),
+        memory_gb=memory_gb(),
+        platform=platform.platform(),
+        python=platform.python_version(),
+        torch=str(torch.__version__) if torch is not None else None,
+        torch_threads=torch.get_num_threads() if torch is not None else None,
+        gpu=sys.modules["torch"].cuda.get_device_name() if _cuda_in_use() else None,
+        load_average=load_average(),
+    )
 
 
-def identity_at_end(before: dict[str, Any]) -> dict[str, Any]:
-    """The identity as it is known when torch and the device have been used, with the load of both moments.
-
-    `load_average` stays that of the beginning, which the run itself has no part in; `load_average_end` has one.
-    """
-    now = identity()
-    return now | {"load_average": before.get("load_average"), "load_average_end": now["load_average"]}
-
-
-def load_average() -> list[float] | None:
+def load_average() -> tuple[float, ...] | None:
     """Processes that wanted to run over the last 1, 5 and 15 minutes; None where the system does not say."""
     try:
-        return [round(value, 2) for value in os.getloadavg()]
+        return tuple(round(value, 2) for value in os.getloadavg())
     except (OSError, AttributeError):  # sandboxes, Windows
         return None
 

@@ -97,7 +97,7 @@ def _comments(chosen: ExportOptions) -> list[str]:
     }[chosen.axes]
     return [
         f"Exported from ihbench {__version__}",
-        f"run: {folder.record['digest']} {identity['method']} {identity['scene']}",
+        f"run: {folder.record.digest} {identity.method} {identity.scene}",
         f"pose: {chosen.pose}",
         "units: metres",
         f"axes: {axes}",

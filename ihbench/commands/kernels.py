@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -32,7 +32,7 @@ def main(argv: list[str]) -> int:
     from ihbench.kernels.table import blocks_of, run_kernels
 
     rows = run_kernels(chosen.kernel, chosen.repeats)
-    about = machine.identity()
+    about = asdict(machine.identity())
     chosen.show({"machine": about, "rows": rows}, blocks_of(about, rows))
     if chosen.figure is not None:
         from ihbench.kernels.figure import draw

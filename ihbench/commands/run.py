@@ -136,10 +136,10 @@ def _repeat(chosen: LikeOptions) -> int:
 
 
 def _print(results: list[RunResult], chosen: Any) -> int:
-    from ihbench.record.results import as_json
+    from ihbench.record.results import summary
 
     if chosen.json:
-        print(json.dumps(as_json(results), allow_nan=False))
+        print(json.dumps(summary(results), allow_nan=False))
     elif not chosen.full:
         print(headline(results), end="")
     else:

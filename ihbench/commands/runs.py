@@ -156,13 +156,10 @@ def _named(chosen: Remove) -> Iterator[dict[str, Any]]:
         except BadInput as error:
             yield _row(folder, {"status": UNREADABLE, "reason": str(error)}, None)
         else:
-            identity = {name: result.identity[name] for name in FILTERS[:-1]}
-            outcome = {
-                "status": result.status,
-                "reason": result.record["reason"],
-                "created": result.record["created"],
-            }
-            yield _row(folder, identity | outcome, result)
+            identity = {name: getattr(result.identity, name) for name in FILTERS[:-1]}
+            outcome = result.record.outcome
+            told = {"status": outcome.status, "reason": outcome.reason, "created": outcome.created}
+            yield _row(folder, identity | told, result)
 
 
 def _row(folder: Path, entry: dict[str, Any], result: RunResult | None) -> dict[str, Any]:
@@ -183,14 +180,11 @@ def _row(folder: Path, entry: dict[str, Any], result: RunResult | None) -> dict[
 
 def _headline(result: RunResult | None) -> tuple[str | None, float | None]:
     """Identity and mean of the headline region's first metric; PSNR where it is there."""
-    from ihbench.metrics import Identity
-
     if result is None or result.status != "done":
         return None, None
-    region = result.record["about"]["headline"]
-    for identity, mean in result.rows[result.method].items():
-        if Identity.parse(identity).region == region and not mean.absent:
-            return identity, mean.value
+    for identity, mean in result.own.items():
+        if identity.region == result.headline and not mean.absent:
+            return str(identity), mean.value
     return None, None
 
 
@@ -208,9 +202,9 @@ def _size(folder: Path) -> int:
 
 def _cells(row: dict[str, Any]) -> tuple[str, ...]:
     from ihbench.errors import visible
-    from ihbench.metrics.identity import metric_of
+    from ihbench.metrics import Identity
 
-    value = "" if row["value"] is None else metric_of(row["identity"]).text(row["value"])
+    value = "" if row["value"] is None else Identity.parse(row["identity"]).display.text(row["value"])
     named = (row[name] for name in ("status", "protocol", "scene", "method", "profile", "seed"))
     texts = ("" if text is None else visible(str(text)) for text in named)
     return (*texts, value, _age(row["created"]), _bytes(row["bytes"]), visible(row["folder"]))

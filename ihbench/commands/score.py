@@ -61,16 +61,17 @@ class ScoreOptions(ProtocolChanges):
 def main(argv: list[str]) -> int:
     chosen = options(ScoreOptions, argv, "score", "Score images that somebody else's code rendered.")
     from ihbench.clock.progress import Progress
-    from ihbench.record.results import as_json
+    from ihbench.files.shape import as_json
+    from ihbench.record.results import summary
 
     if chosen.names:
         return _print_names(chosen, _source(chosen)[0])
     results = scored(chosen, Progress())
-    complete = all(not result.record["about"]["predictions"]["missing"] for result in results)
+    complete = all(not result.missing_views for result in results)
     if chosen.json:
-        told = as_json(results)
+        told = summary(results)
         for run, result in zip(told["runs"], results, strict=True):
-            run["predictions"] = result.record["about"]["predictions"]
+            run["predictions"] = as_json(result.about.predictions)
         print(json.dumps(told, allow_nan=False))
     else:
         print(registry.load("report", "md")(results) if chosen.full else headline(results), end="")
@@ -96,11 +97,12 @@ def scored(chosen: ScoreOptions, progress: Progress) -> list[RunResult]:
         progress.say(f"{protocol.name} {scene}: predictions {name}, {protocol.profile} profile")
         results.append(score_scene(request, source, scene, progress))
     for result in results:
-        found = result.record["about"]["predictions"]
-        for kind in ("missing", "surplus"):
-            for path in found[kind]:
+        found = result.about.predictions
+        assert found is not None
+        for kind, paths in (("missing", found.missing), ("surplus", found.surplus)):
+            for path in paths:
                 progress.say(f"{result.scene}: {kind}: {path}")
-        for note in [*found["notes"], *found["doubts"]]:
+        for note in [*found.notes, *found.doubts]:
             progress.say(f"{result.scene}: {note}")
     return results
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
+from functools import lru_cache
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,13 @@ class Identity:
         parts = [self.metric, self.variant, self.value_range, self.region, self.background, f"v{self.version}"]
         return "/".join(part for part in parts if part)
 
+    @property
+    def display(self) -> Metric:
+        """How its metric is shown."""
+        return metric_of(self.metric)
+
     @classmethod
+    @lru_cache(10_000)
     def parse(cls, text: str) -> Identity:
         """The parts of an identity string. Raises `ValueError` when it is none."""
         *parts, version = text.split("/")
@@ -97,9 +104,8 @@ class Score:
         return cls(math.nan, identity, reason)
 
 
-def metric_of(identity: str) -> Metric:
-    """How the metric of an identity string is shown; one that a third party added has its own name and 4 decimals."""
-    name = identity.partition("/")[0]
+def metric_of(name: str) -> Metric:
+    """How a metric is shown; one that a third party added has its own name and 4 decimals."""
     return METRICS.get(name, Metric(name, True, 4))
 
 

@@ -14,15 +14,16 @@ import time
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from ihbench.errors import BadInput
 from ihbench.files import removal
-from ihbench.metrics import Mean
-from ihbench.record.results import RunResult, read_result, without_copies
+from ihbench.files.shape import as_json, from_json
+from ihbench.record.results import Rows, RunResult, read_result, without_copies
+from ihbench.record.schema import CurvePoint, RunRecord
 from ihbench.record.store import INDEX, KILLED, OUR_NAME
 from ihbench.version import __version__
 
@@ -225,6 +226,17 @@ class Index:
         return own or FORMER in head
 
 
+@dataclass(frozen=True)
+class _Content:
+    """What the database keeps of a `RunResult`."""
+
+    record: RunRecord
+    rows: Rows
+    presets: Mapping[str, Rows]
+    curve: tuple[CurvePoint, ...]
+    damage: tuple[str, ...]
+
+
 def _holds_a_run(folder: Path) -> bool:
     """Whether there is a record, or numbers of a run that has lost its record."""
     if os.path.lexists(folder / "run.json"):
@@ -261,16 +273,13 @@ def _read(folder: Path, signed: str) -> tuple[Entry, RunResult | None]:
     except BadInput as error:
         reason = str(error).removeprefix(f"{folder}/").removeprefix(f"{folder}: ")
         return Entry(name, signed, None, None, None, None, None, UNREADABLE, _printable(reason), None), None
-    identity, record = result.identity, result.record
-    if result.status == "running" or record["reason"] == KILLED:
+    identity = result.identity
+    if result.status == "running" or result.reason == KILLED:
         signed += " at that moment"  # no file changes when a process dies: to be read again
-    protocol, scene, method, profile = (
-        _printable(identity[key]) for key in ("protocol", "scene", "method", "profile")
-    )
-    reason = _printable(record["reason"])
-    entry = Entry(
-        name, signed, protocol, scene, method, profile, identity["seed"], result.status, reason, record["created"]
-    )
+    named = (_printable(t) for t in (identity.protocol, identity.scene, identity.method, identity.profile))
+    protocol, scene, method, profile = named
+    reason, created = _printable(result.reason), result.record.outcome.created
+    entry = Entry(name, signed, protocol, scene, method, profile, identity.seed, result.status, reason, created)
     return entry, result
 
 
@@ -317,12 +326,13 @@ def _make(database: sqlite3.Connection) -> None:
 @cache
 def this_code() -> str:
     """Changes with the code that reads run folders: what other code has read is read again."""
+    from ihbench.files import shape
     from ihbench.metrics import aggregate, identity
-    from ihbench.record import results, shape, store
+    from ihbench.record import migrations, results, store
     from ihbench.record import schema as record
 
     digest = hashlib.sha256(f"{__version__}\n{SCHEMA}".encode())
-    for module in (record, results, shape, store, aggregate, identity):
+    for module in (record, results, shape, store, migrations, aggregate, identity):
         with suppress(OSError, TypeError):
             digest.update(Path(module.__file__).read_bytes())  # type: ignore[arg-type]
     with suppress(OSError):
@@ -331,38 +341,15 @@ def this_code() -> str:
 
 
 def _packed(result: RunResult) -> bytes:
-    def means(rows: Mapping[str, Mapping[str, Mean]]) -> dict[str, Any]:
-        return {
-            row: {i: [m.value, m.reason, m.n, m.infinite, m.absent_count] for i, m in found.items()}
-            for row, found in rows.items()
-        }
-
-    content = {
-        "record": result.record,
-        "rows": means(result.rows),
-        "presets": {name: means(rows) for name, rows in result.presets.items()},
-        "curve": result.curve,
-        "damage": result.damage,
-    }
-    return zlib.compress(json.dumps(content).encode(), 1)
+    return zlib.compress(
+        json.dumps(as_json(_Content(**{f.name: getattr(result, f.name) for f in fields(_Content)}))).encode(), 1
+    )
 
 
 def _unpacked(folder: Path, content: Any) -> RunResult | None:
     """The inverse of `_packed`; None for what it cannot have made."""
-
-    def means(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Mean]]:
-        return {
-            row: {
-                identity: Mean(value, identity, reason, n, infinite, absent)
-                for identity, (value, reason, n, infinite, absent) in found.items()
-            }
-            for row, found in rows.items()
-        }
-
     try:
-        read = json.loads(zlib.decompress(content))
-        presets = {name: means(rows) for name, rows in read["presets"].items()}
-        return RunResult(folder, read["record"], means(read["rows"]), presets, read["curve"], tuple(read["damage"]))
+        return RunResult(folder, **vars(from_json(json.loads(zlib.decompress(content)), _Content)))
     except (zlib.error, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None
 

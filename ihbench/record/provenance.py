@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 import platform
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 from ihbench import registry
 from ihbench.version import __version__
@@ -34,9 +34,26 @@ PACKAGES = (
 _words: list[str] = []  # of the command that this process was started for; none from Python
 
 
-def provenance() -> dict[str, Any]:
-    """Versions to store with a run. Reads package metadata only; imports none of the packages."""
-    return {"ihbench": __version__, "git": git_state(), "packages": package_versions()}
+@dataclass(frozen=True)
+class GitState:
+    """A commit, and whether files differ from it."""
+
+    commit: str
+    dirty: bool
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Versions to store with a run."""
+
+    ihbench: str = ""
+    git: GitState | None = None  # None outside a checkout
+    packages: Mapping[str, str] = field(default_factory=dict)
+
+
+def provenance() -> Provenance:
+    """What computes here. Reads package metadata only; imports none of the packages."""
+    return Provenance(__version__, git_state(), package_versions())
 
 
 def package_versions() -> dict[str, str]:
@@ -70,19 +87,19 @@ def _without_folders(word: str) -> str:
 def description() -> str:
     """What `ihbench --version` says: the version, the commit, and what computes."""
     git, packages = git_state(), package_versions()
-    commit = "" if git is None else f", commit {git['commit'][:10]}{' with changes' if git['dirty'] else ''}"
+    commit = "" if git is None else f", commit {git.commit[:10]}{' with changes' if git.dirty else ''}"
     computing = ", ".join(f"{name} {packages[name]}" for name in ("torch", "numpy", "numba") if name in packages)
     return f"{__version__}{commit} (Python {platform.python_version()}, {computing})"
 
 
-def git_state(folder: Path | None = None) -> dict[str, Any] | None:
+def git_state(folder: Path | None = None) -> GitState | None:
     """Commit of the checkout this code runs from and whether files differ from it; None outside a checkout."""
     folder = folder if folder is not None else Path(__file__).resolve().parent
     if _git(folder, "ls-files", "--error-unmatch", "__init__.py") is None:
         return None  # installed into some other project's checkout, or into none
     commit = _git(folder, "rev-parse", "HEAD")
     changed = _git(folder, "status", "--porcelain", "--untracked-files=no")
-    return None if commit is None or changed is None else {"commit": commit, "dirty": bool(changed)}
+    return None if commit is None or changed is None else GitState(commit, bool(changed))
 
 
 def _git(folder: Path, *arguments: str) -> str | None:

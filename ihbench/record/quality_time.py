@@ -9,16 +9,16 @@ there is none.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.errors import BadInput
 from ihbench.metrics.aggregate import LARGEST
-from ihbench.metrics.identity import METRICS
+from ihbench.metrics.identity import METRICS, Identity
+from ihbench.record.schema import CurvePoint
 from ihbench.scene.spread import spread
 
 NEVER = math.inf  # seconds to a quality that the run did not reach
@@ -74,7 +74,7 @@ class Target:
         return cls(metric, number, region)
 
 
-def curve_of(points: Iterable[Mapping[str, Any]], identity: str, higher_is_better: bool) -> QualityCurve:
+def curve_of(points: Iterable[CurvePoint], identity: Identity) -> QualityCurve:
     """The curve of one identity from the rows of a `curve.jsonl`, in any order.
 
     Points without a number (absent, NaN, finite beyond `aggregate.LARGEST`) and without a positive time are left out;
@@ -82,11 +82,11 @@ def curve_of(points: Iterable[Mapping[str, Any]], identity: str, higher_is_bette
     """
     found: dict[float, float] = {}
     for point in points:
-        seconds, value = float(point["seconds"]), float(point["scores"].get(identity, math.nan))
+        seconds, value = point.seconds, point.scores.get(identity, math.nan)
         if math.isfinite(seconds) and seconds > 0 and (abs(value) <= LARGEST or value == math.inf):
             found[seconds] = value
     times = sorted(found)
-    return QualityCurve(np.array(times), np.array([found[t] for t in times]), higher_is_better)
+    return QualityCurve(np.array(times), np.array([found[t] for t in times]), identity.display.higher_is_better)
 
 
 def time_to_quality(curve: QualityCurve, target: float) -> float:

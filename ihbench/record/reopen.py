@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ihbench.body import load_body
 from ihbench.errors import BadInput
-from ihbench.record.schema import outcome_fault
+from ihbench.record.schema import RunRecord, outcome_fault
 from ihbench.record.store import RunFolder
 from ihbench.scene.capture_digest import capture_digest
 from ihbench.scene.contracts import Capture
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 def reopen_body(folder: Path, data: Path | None, body: Path | None) -> Body:
     """The body model of a run's poses. Raises `BadInput` when the run needs an SMPL file and none is named."""
-    about = _record(folder)["about"]
-    if about["standin"]:
+    about = _record(folder).about
+    if about.standin:
         return load_body()
-    if about.get("body") == "own":
+    if about.body == "own":
         return reopen_capture(folder, data, body).model
     named = own_body(body)
     if named is None:
@@ -37,16 +37,16 @@ def reopen_body(folder: Path, data: Path | None, body: Path | None) -> Body:
 def reopen_capture(folder: Path, data: Path | None, body: Path | None) -> Capture:
     """The capture of a run. Raises `BadInput` when other data lie where it is looked for."""
     record = _record(folder)
-    about, identity = record["about"], record["identity"]
+    about, identity = record.about, record.identity
     root = own_data(data)
-    if root is None and not about["standin"]:
+    if root is None and not about.standin:
         raise BadInput(f"{folder}: was made on real data; name the folder of your copy with --data")
-    root = root or standin_root(identity["dataset"])
-    found = open_capture(identity["dataset"], root, identity["scene"], body)[0]
-    if found.standin != about["standin"]:
+    root = root or standin_root(identity.dataset)
+    found = open_capture(identity.dataset, root, identity.scene, body)[0]
+    if found.standin != about.standin:
         raise BadInput(
             f"{root}: holds {found.standin or 'real data'}, the run was made on "
-            f"{about['standin'] or 'real data'}; name its data with --data"
+            f"{about.standin or 'real data'}; name its data with --data"
         )
     return found
 
@@ -54,21 +54,21 @@ def reopen_capture(folder: Path, data: Path | None, body: Path | None) -> Captur
 def reopen_protocol(folder: Path) -> Protocol:
     """The protocol of a run, as it was then. Raises `BadInput` when it is neither on record nor still the same."""
     record = RunFolder.open(folder).record
-    identity, content = record["identity"], record["about"].get("protocol")
-    name, _, version = identity["protocol"].partition("@")
+    identity, content = record.identity, record.about.protocol
+    name, _, version = identity.protocol.partition("@")
     if content is None:
-        protocol = load_protocol(name, identity["profile"])
+        protocol = load_protocol(name, identity.profile)
     else:
-        protocol = protocol_from(content, identity["profile"], version)
-    if protocol.digest != identity["protocol_digest"]:
-        raise BadInput(f"{folder}: its protocol {identity['protocol']} is not on record and is another one now")
+        protocol = protocol_from(dict(content), identity.profile, version)
+    if protocol.digest != identity.protocol_digest:
+        raise BadInput(f"{folder}: its protocol {identity.protocol} is not on record and is another one now")
     return protocol
 
 
 def reopen_scene(folder: Path, data: Path | None, body: Path | None) -> tuple[OccludedScene, Body]:
     """The scene of a run, with its truth, and the body. Raises `BadInput` when the data are not those of the run."""
     protocol, capture = reopen_protocol(folder), reopen_capture(folder, data, body)
-    on_record = RunFolder.open(folder).identity["data"]
+    on_record = RunFolder.open(folder).identity.data
     if capture_digest(capture, protocol) not in on_record:
         raise BadInput(
             f"{folder}: the data of {capture.name} are not those that the run was made on; name its --data"
@@ -82,7 +82,7 @@ def reopen_scene(folder: Path, data: Path | None, body: Path | None) -> tuple[Oc
     return scene, reopen_body(folder, data, body)
 
 
-def _record(folder: Path) -> dict[str, Any]:
+def _record(folder: Path) -> RunRecord:
     """The record of a run that says what it was made on. Raises `BadInput` for one that does not."""
     record = RunFolder.open(folder).record
     if found := outcome_fault(record):

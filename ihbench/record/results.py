@@ -4,22 +4,34 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ihbench.errors import BadInput
 from ihbench.files import atomic
-from ihbench.metrics import Mean, Score, mean_over_frames
-from ihbench.record.schema import curve_points, outcome_fault, preset_lines, score_lines
+from ihbench.metrics import Identity, Mean, Score, mean_over_frames
+from ihbench.record.schema import (
+    About,
+    CurvePoint,
+    RunIdentity,
+    RunRecord,
+    ScoreLine,
+    Status,
+    curve_points,
+    outcome_fault,
+    preset_lines,
+    score_lines,
+)
 from ihbench.record.store import RunFolder
 
 if TYPE_CHECKING:
     from ihbench.scoring.scoring import ViewScores
 
 TRACEBACK = "traceback.txt"  # of a run that failed, in its folder
-Rows = dict[str, dict[str, Mean]]  # row name -> identity -> mean over the scene's test views
+Rows = Mapping[str, Mapping[Identity, Mean]]  # row name -> identity -> mean over the scene's test views
+Group = tuple[str, str, str, str]  # protocol, its digest, profile, which data
 
 
 @dataclass(frozen=True)
@@ -27,58 +39,98 @@ class RunResult:
     """One run folder, read and checked: see `ihbench.record.schema`."""
 
     folder: Path
-    record: dict[str, Any]  # run.json
+    record: RunRecord  # run.json
     rows: Rows
-    presets: dict[str, Rows] = field(default_factory=dict)  # preset scored later -> its rows
-    curve: list[dict[str, Any]] = field(default_factory=list)  # points, see `RunFolder.add_curve_point`
+    presets: Mapping[str, Rows] = field(default_factory=dict)  # preset scored later -> its rows
+    curve: Sequence[CurvePoint] = ()
     damage: tuple[str, ...] = ()  # files that no number in `rows` comes from and that cannot be read, and why
 
     @property
-    def status(self) -> str:
-        return self.record["status"]
+    def status(self) -> Status:
+        return self.record.outcome.status
+
+    @property
+    def reason(self) -> str:
+        return self.record.outcome.reason
 
     @property
     def outcome(self) -> str:
         """The status, and why where it is not done, with the path of the traceback where there is one."""
-        reason = self.record["reason"].replace(f"(see {TRACEBACK})", f"(see {self.folder / TRACEBACK})")
+        reason = self.reason.replace(f"(see {TRACEBACK})", f"(see {self.folder / TRACEBACK})")
         return f"{self.status}: {reason}" if reason else self.status
 
     @property
-    def identity(self) -> dict[str, Any]:
-        return self.record["identity"]
+    def identity(self) -> RunIdentity:
+        return self.record.identity
+
+    @property
+    def about(self) -> About:
+        return self.record.about
 
     @property
     def method(self) -> str:
-        return self.identity["method"]
+        return self.identity.method
 
     @property
     def scene(self) -> str:
-        return self.identity["scene"]
+        return self.identity.scene
 
     @property
-    def group(self) -> tuple[str, str, str, str]:
-        """Runs of one group may stand in one table: protocol, its digest, profile, which data."""
-        identity = self.identity
-        return identity["protocol"], identity["protocol_digest"], identity["profile"], self.data
+    def seed(self) -> int:
+        return self.identity.seed
+
+    @property
+    def headline(self) -> str:
+        return self.about.headline or ""
+
+    @property
+    def own(self) -> Mapping[Identity, Mean]:
+        """The method's row of scores; empty where it has none."""
+        return self.rows.get(self.method, {})
+
+    @property
+    def group(self) -> Group:
+        """Runs of one group may stand in one table."""
+        return self.identity.protocol, self.identity.protocol_digest, self.identity.profile, self.data
 
     @property
     def planned(self) -> dict[str, Any]:
         """Switches that the plan has changed for this scene -> the value that was in force."""
-        omissions = self.record["about"].get("left_out", ())
-        return {o["field"]: o["value"] for o in omissions if o["value"] is not None}
+        return {o.field: o.value for o in self.about.left_out or () if o.value is not None}
+
+    @property
+    def switches(self) -> dict[str, Any]:
+        """Dotted name -> value of the method's switches, as the scene's plan left them."""
+        return self.identity.switches | self.planned
+
+    @property
+    def fit_seconds(self) -> float:
+        """NaN for what was not fitted here."""
+        return math.nan if self.about.fit_seconds is None else self.about.fit_seconds
+
+    @property
+    def timed(self) -> bool:
+        return self.about.fit_seconds is not None
 
     @property
     def missing_views(self) -> int:
         """Test views without an image, over which the means do not run: of predictions whose files were missing."""
-        return len(self.record["about"].get("predictions", {}).get("missing", ()))
+        return 0 if self.about.predictions is None else len(self.about.predictions.missing)
 
     @property
     def data(self) -> str:
         """What the run was made on, as a table names it."""
-        about = self.record["about"]
-        if about["standin"]:
-            return f"{about['standin']}: made by the bench, not real data"
-        return f"real data ({about['variant']})"
+        if self.about.standin:
+            return f"{self.about.standin}: made by the bench, not real data"
+        return f"real data ({self.about.variant})"
+
+
+def by_group(results: Iterable[RunResult]) -> dict[Group, list[RunResult]]:
+    """Runs that may stand in one table, in the order given."""
+    groups: dict[Group, list[RunResult]] = {}
+    for result in results:
+        groups.setdefault(result.group, []).append(result)
+    return groups
 
 
 def group_row(row: str, group: str) -> str:
@@ -86,28 +138,28 @@ def group_row(row: str, group: str) -> str:
     return f"{row} [{group}]" if group else row
 
 
-def view_rows(row: str, scores: Iterable[ViewScores]) -> list[dict[str, Any]]:
-    """Per-view scores as JSON lines: one object per test view, absent numbers with their reasons."""
+def view_rows(row: str, scores: Iterable[ViewScores]) -> list[ScoreLine]:
+    """Per-view scores as lines: one for each test view, absent numbers with their reasons."""
     return [
-        {
-            "row": group_row(row, view.key.group),
-            "camera": view.key.camera_id,
-            "frame": view.key.frame,
-            "scores": {identity: score.value for identity, score in view.scores.items()},
-            "absent": {identity: score.reason for identity, score in view.scores.items() if score.absent},
-        }
+        ScoreLine(
+            group_row(row, view.key.group),
+            view.key.camera_id,
+            view.key.frame,
+            {Identity.parse(identity): score.value for identity, score in view.scores.items()},
+            {identity: score.reason for identity, score in view.scores.items() if score.absent},
+        )
         for view in scores
     ]
 
 
-def mean_rows(lines: Iterable[dict[str, Any]]) -> Rows:
+def mean_rows(lines: Iterable[ScoreLine]) -> Rows:
     """The inverse of `view_rows` up to the mean over views: row -> identity -> mean."""
-    scores: dict[str, dict[str, list[Score]]] = {}
+    scores: dict[str, dict[Identity, list[Score]]] = {}
     for line in lines:
-        for identity, value in line["scores"].items():
-            value = float(value)
-            reason = line["absent"].get(identity, "no reason recorded") if math.isnan(value) else ""
-            scores.setdefault(line["row"], {}).setdefault(identity, []).append(Score(value, identity, reason))
+        for identity, value in line.scores.items():
+            name, value = str(identity), float(value)
+            reason = line.absent.get(name, "no reason recorded") if math.isnan(value) else ""
+            scores.setdefault(line.row, {}).setdefault(identity, []).append(Score(value, name, reason))
     return {
         row: {identity: mean_over_frames(values) for identity, values in by_identity.items()}
         for row, by_identity in scores.items()
@@ -121,20 +173,20 @@ def read_result(folder: Path) -> RunResult:
     record = run.record
     if found := outcome_fault(record):
         raise BadInput(f"{folder / 'run.json'}: {found}; run the same command with --force")
-    method = record["identity"]["method"]
+    method = record.identity.method
     own, others = (_read_if_there(folder / name, score_lines) for name in ("scores.jsonl", "calibration.jsonl"))
     if found := _mixed_up(method, own, others):
         raise BadInput(f"{folder}: its score files are damaged ({found}); run the same command with --force")
     rows = mean_rows([*own, *others])
-    if record["status"] == "done" and method not in rows:
+    if run.status == "done" and method not in rows:
         raise BadInput(f"{folder}: is done, but its scores are gone; run the same command with --force")
     presets: dict[str, Rows] = {}
-    curve: list[dict[str, Any]] = []
-    damage = []
+    curve: list[CurvePoint] = []
+    damage: list[str] = []
     for file in sorted((folder / "presets").glob("*.jsonl")):
         try:
             _, lines = preset_lines(file)
-            mine, others = ([x for x in lines if _is_row_of(method, x["row"]) is own] for own in (True, False))
+            mine, others = ([x for x in lines if _is_row_of(method, x.row) is own] for own in (True, False))
             if found := _mixed_up(method, mine, others) if mine else f"no row of {method[:80]!a}":
                 raise BadInput(f"{file}: {found}")
             presets[file.stem] = mean_rows(lines)
@@ -167,12 +219,12 @@ def without_copies(results: Sequence[RunResult]) -> tuple[list[RunResult], list[
     folders the one counts that has the run's own name."""
     first: dict[str, RunResult] = {}
     for result in results:
-        other = first.setdefault(result.record["digest"], result)
+        other = first.setdefault(result.record.digest, result)
         if _has_own_name(result) and not _has_own_name(other):
-            first[result.record["digest"]] = result
+            first[result.record.digest] = result
     kept, left_out = [], []
     for result in results:
-        one = first[result.record["digest"]]
+        one = first[result.record.digest]
         if one is result:
             kept.append(result)
         else:
@@ -181,25 +233,25 @@ def without_copies(results: Sequence[RunResult]) -> tuple[list[RunResult], list[
 
 
 def _has_own_name(result: RunResult) -> bool:
-    return result.folder.name.endswith(f"__{result.record['digest']}")
+    return result.folder.name.endswith(f"__{result.record.digest}")
 
 
 def _read_if_there(file: Path, read: Callable[[Path], list[Any]]) -> list[Any]:
     return read(file) if os.path.lexists(file) else []
 
 
-def _mixed_up(method: str, own: Sequence[dict[str, Any]], others: Sequence[dict[str, Any]]) -> str:
+def _mixed_up(method: str, own: Sequence[ScoreLine], others: Sequence[ScoreLine]) -> str:
     """How score lines contradict each other; "" where they do not. All rows of a group of test views have the same
     views: a mean over fewer is not to be compared with the others."""
     groups: dict[str, dict[str, set[tuple[Any, int]]]] = {}
     for lines, of_method in ((own, True), (others, False)):
-        for row in {line["row"] for line in lines}:
+        for row in {line.row for line in lines}:
             if _is_row_of(method, row) is not of_method:
                 return f"row {row[:80]!a} {'is none of' if of_method else 'belongs to'} {method[:80]!a}"
     for line in (*own, *others):
-        row = line["row"]
+        row = line.row
         group = row.removeprefix(method) if _is_row_of(method, row) else "".join(row.partition(" [")[1:])
-        groups.setdefault(group, {}).setdefault(row, set()).add((line["camera"], line["frame"]))
+        groups.setdefault(group, {}).setdefault(row, set()).add((line.camera, line.frame))
     for rows in groups.values():
         every = set().union(*rows.values())
         for row, views in rows.items():
@@ -212,7 +264,7 @@ def _is_row_of(method: str, row: str) -> bool:
     return row == method or (row.startswith(f"{method} [") and row.endswith("]"))
 
 
-def as_json(results: Iterable[RunResult]) -> dict[str, Any]:
+def summary(results: Iterable[RunResult]) -> dict[str, Any]:
     """What `--json` prints of runs: strict JSON, numbers that are not finite as strings."""
     results = list(results)
     return {
@@ -222,18 +274,18 @@ def as_json(results: Iterable[RunResult]) -> dict[str, Any]:
                 "folder": str(r.folder),
                 "scene": r.scene,
                 "method": r.method,
-                "seed": r.identity["seed"],
+                "seed": r.seed,
                 "status": r.status,
-                "reason": r.record["reason"],
-                "standin": r.record["about"]["standin"],
+                "reason": r.reason,
+                "standin": r.about.standin,
                 "missing_views": r.missing_views,
                 "scores": {
-                    row: {identity: atomic.encode(mean.value) for identity, mean in means.items()}
+                    row: {str(identity): atomic.encode(mean.value) for identity, mean in means.items()}
                     for row, means in r.rows.items()
                 },
-                "fit_seconds": r.record["about"].get("fit_seconds"),
-                "total_seconds": r.record["about"].get("total_seconds"),
-                "peak_mb": r.record["about"].get("peak_mb"),
+                "fit_seconds": r.about.fit_seconds,
+                "total_seconds": r.about.total_seconds,
+                "peak_mb": r.about.peak_mb,
             }
             for r in results
         ],

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TypeVar
 
 from ihbench.errors import BadInput
-from ihbench.metrics import Identity
-from ihbench.record.results import RunResult
+from ihbench.metrics import Identity, Mean
+from ihbench.record.results import Rows, RunResult, by_group
 from ihbench.record.row_labels import by_configuration
 from ihbench.registry import nearest
 from ihbench.scoring.calibration import ROWS
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -78,14 +80,12 @@ class Choice:
         """The runs with what is wanted of them, in order. Raises `BadInput` as `check` does."""
         if self == EVERYTHING:
             return list(results)
-        groups: dict[Any, list[RunResult]] = {}
-        for run in results:
-            groups.setdefault(run.group, []).append(run)
+        groups = by_group(results)
         labelled: list[dict[str, list[RunResult]]] = []
         for runs in groups.values():
             done = [run for run in runs if run.status == "done"]
             labelled.append(by_configuration(done))
-        every = [Identity.parse(i) for run in results for scores in _scores(run) for i in scores]
+        every = [i for run in results for scores in _scores(run) for i in scores]
         labels = {label: runs[0].method for by_label in labelled for label, runs in by_label.items()}
         self.check(labels, [i.metric for i in every], [i.region for i in every])
         names = self.renamed(labels)
@@ -97,35 +97,32 @@ class Choice:
         return found
 
     def _run(self, run: RunResult, name: str | None) -> RunResult:
-        about = dict(run.record["about"]) | ({} if name is None else {"label": name})
-        if self.regions and about["headline"] not in self.regions:
-            about["headline"] = self.regions[0]
-        chosen = replace(
+        about = run.about if name is None else replace(run.about, label=name)
+        if self.regions and about.headline not in self.regions:
+            about = replace(about, headline=self.regions[0])
+        return replace(
             run,
-            record={**run.record, "about": about},
+            record=replace(run.record, about=about),
             rows=self._rows(run.rows),
             presets={preset: self._rows(rows) for preset, rows in run.presets.items()},
+            curve=[replace(point, scores=self._scores(point.scores)) for point in run.curve],
         )
-        curve = [{**point, "scores": self._scores(point["scores"])} for point in run.curve]
-        vars(chosen)["curve"] = curve  # a cached property of a file
-        return chosen
 
-    def _rows(self, rows: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    def _rows(self, rows: Rows) -> Rows:
         return {row: self._scores(scores) for row, scores in rows.items() if row not in ROWS or self.bounds([row])}
 
-    def _scores(self, scores: Mapping[str, Any]) -> dict[str, Any]:
-        found = {}
-        for identity, value in scores.items():
-            parsed = Identity.parse(identity)
-            if self.has_metric(parsed.metric) and (not self.regions or parsed.region in self.regions):
-                found[identity] = value
-        return found
+    def _scores(self, scores: Mapping[Identity, T]) -> dict[Identity, T]:
+        return {
+            identity: value
+            for identity, value in scores.items()
+            if self.has_metric(identity.metric) and (not self.regions or identity.region in self.regions)
+        }
 
 
 EVERYTHING = Choice()
 
 
-def _scores(run: RunResult) -> Iterable[Mapping[str, Any]]:
+def _scores(run: RunResult) -> Iterable[Mapping[Identity, Mean]]:
     yield from run.rows.values()
     for rows in run.presets.values():
         yield from rows.values()

@@ -16,7 +16,7 @@ def by_configuration(runs: Sequence[RunResult]) -> dict[str, list[RunResult]]:
     """Runs by the label alone, without what is told beside it: that views are missing."""
     codes: dict[str, set[str]] = {}
     for run in runs:
-        codes.setdefault(run.method, set()).add(run.identity["code"])
+        codes.setdefault(run.method, set()).add(run.identity.code)
     found: dict[str, list[RunResult]] = {}
     for run in runs:
         found.setdefault(_label(run, several_codes=len(codes[run.method]) > 1), []).append(run)
@@ -28,7 +28,7 @@ def _with_views(label: str, runs: Sequence[RunResult]) -> str:
     missing = sum(run.missing_views for run in runs)
     if not missing:
         return label
-    views = sum(run.record["about"].get("predictions", {}).get("views", 0) for run in runs)
+    views = sum(run.about.predictions.views for run in runs if run.about.predictions is not None)
     told = f"only {views - missing} of {views} views" if views else f"{missing} views missing"
     return f"{label[:-1]}, {told})" if label.endswith(")") else f"{label} ({told})"
 
@@ -36,11 +36,11 @@ def _with_views(label: str, runs: Sequence[RunResult]) -> str:
 def _label(run: RunResult, several_codes: bool) -> str:
     """The method with what sets this row apart, or the name that somebody gave the row. Runs of several versions of
     its code are several rows."""
-    if "label" in run.record["about"]:
-        return run.record["about"]["label"]
-    changed = list(run.record["about"]["changed"])
-    if run.record["about"].get("provenance") == "predictions":
+    if run.about.label is not None:
+        return run.about.label
+    changed = run.about.differences
+    if run.about.predictions is not None:
         changed.append("predictions")
     if several_codes:
-        changed.append(f"code {run.identity['code']}")
+        changed.append(f"code {run.identity.code}")
     return run.method + (f" ({', '.join(changed)})" if changed else "")

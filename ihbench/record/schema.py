@@ -8,21 +8,27 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from datetime import datetime
-from functools import lru_cache
+from hashlib import sha256
 from pathlib import Path
-from typing import Annotated, Any, Literal, NotRequired, TypedDict
+from typing import Annotated, Any, Literal
 
+from ihbench.clock.events import Event
+from ihbench.clock.machine import Machine
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.regular import read_bytes
-from ihbench.metrics.identity import Identity as MetricIdentity
-from ihbench.record.shape import WHOLE, Matches, Within, fault
+from ihbench.files.shape import WHOLE, Matches, Within, as_json, fault, from_json
+from ihbench.metrics.identity import Identity
+from ihbench.record.provenance import Provenance
+from ihbench.scene.plan import Omission
 
+SCHEMA_VERSION = 2
 LARGEST_RECORD = 32 * 2**20  # bytes; no honest run.json comes near
 LARGEST_TABLE = 256 * 2**20  # bytes; nor do scores
+HASH_LENGTH = 10
 
 Status = Literal["running", "done", "diverged", "failed", "interrupted", "skipped", "timeout"]
 
@@ -47,152 +53,239 @@ Words = Annotated[str, Matches(re.compile(r"(?s).{1,1000}"), "a name of 1 to 100
 StagePath = Annotated[
     str, Matches(re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.+-]{0,99}(/[A-Za-z0-9][A-Za-z0-9 _.+-]{0,99}){0,9}"), "a stage")
 ]  # fmt: skip
+Scores = Mapping[Identity, Annotated[float, Within(-1e12, 1e12, nan=True, infinite=True)]]
+Json = Mapping[str, Any]
 
 
-class Config(TypedDict):
-    keep: NotRequired[list[str]]
+@dataclass(frozen=True)
+class Outcome:
+    """How far a run came, and why no further."""
 
-
-class Identity(TypedDict):
-    """See `store.RunIdentity`, which has every field; what a later version adds is covered by the digest."""
-
-    protocol: Words
-    protocol_digest: Words
-    dataset: Words
-    scene: Words
-    data: str
-    method: Words
-    config: Config
-    profile: Words
-    seed: Count
-    body: str
-    code: str
-
-
-class Omission(TypedDict):
-    field: str
-    value: Any
-    reason: str
-    spares: NotRequired[dict[str, float]]
-
-
-class Subjects(TypedDict):
-    names: NotRequired[list[str]]
-    standin: NotRequired[list[str]]
-
-
-class Image(TypedDict):
-    size: NotRequired[Annotated[int, Within(1, 100_000)]]
-
-
-class ProtocolContent(TypedDict):
-    subjects: NotRequired[Subjects]
-    image: NotRequired[Image]
-
-
-class PredictionFiles(TypedDict):
-    missing: list[str]
-    surplus: list[str]
-    notes: list[str]
-    doubts: NotRequired[list[str]]
-    alpha: NotRequired[str]
-    views: NotRequired[Count]
-
-
-class About(TypedDict):
-    """What a reader of the result should know. A run that failed early knows little."""
-
-    standin: NotRequired[str]
-    variant: NotRequired[str]
-    body: NotRequired[str]
-    headline: NotRequired[Words]
-    protocol: NotRequired[ProtocolContent]
-    device: NotRequired[str]
-    command: NotRequired[list[str]]
-    provenance: NotRequired[str]
-    label: NotRequired[str]
-    predictions: NotRequired[PredictionFiles]
-    changed: NotRequired[list[str]]
-    left_out: NotRequired[list[Omission]]
-    avatar_files: NotRequired[list[str]]
-    fit_seconds: NotRequired[Seconds | None]
-    total_seconds: NotRequired[Seconds]
-    peak_mb: NotRequired[Megabytes]
-
-
-class Machine(TypedDict):
-    cpu: NotRequired[str | None]
-    cores: NotRequired[Annotated[int, Within(1, 1e6)] | None]
-    cores_usable: NotRequired[Annotated[int, Within(1, 1e6)] | None]
-    torch_threads: NotRequired[Annotated[int, Within(1, 1e6)] | None]
-    gpu: NotRequired[str | None]
-    load_average: NotRequired[list[Seconds] | None]
-    load_average_end: NotRequired[list[Seconds] | None]
-
-
-class Stage(TypedDict):
-    seconds: Seconds
-    cpu_seconds: NotRequired[float]
-    peak_mb: NotRequired[Megabytes]
-    peak_device_mb: NotRequired[Megabytes | None]
-    entered: NotRequired[Count]
-
-
-class Event(TypedDict):
-    kind: str
-    data: dict[str, Any]
-    fit_seconds: NotRequired[float]
-    seconds: NotRequired[float]
-
-
-class LedgerState(TypedDict):
-    stages: dict[StagePath, Stage]
-    seconds: Seconds
-    cpu_seconds: float
-    events: list[Event]
-
-
-class Record(TypedDict):
-    """run.json"""
-
-    schema_version: int
     status: Status
     reason: str
-    digest: Words
-    identity: Identity
-    about: About
     created: Moment
-    updated: NotRequired[Moment]
-    provenance: NotRequired[dict[str, Any] | None]
-    machine: NotRequired[Machine | None]
-    ledger: NotRequired[LedgerState | None]
-    warnings: list[str]
+    updated: Moment | None = None
+    step: Count | None = None  # of the fit, at which it diverged
 
 
-class ScoreLine(TypedDict):
+@dataclass(frozen=True)
+class RunIdentity:
+    """Everything that affects the answer of a run, and nothing else."""
+
+    protocol: Words  # id@version
+    protocol_digest: Words  # hash of the protocol's content
+    dataset: Words
+    scene: Words
+    data: str  # which copy of the data: variant, or the stand-in's version and seed
+    method: Words
+    config: Json  # every switch of the method; JSON-able
+    profile: Words
+    seed: Count
+    body: str  # hash of the body model
+    code: str  # version, hash of the method's code, hash of the bench's: see `source_digest`
+    more: Json = field(default_factory=dict)  # what another version of the bench says besides
+
+    @property
+    def digest(self) -> str:
+        """Hex digits that name this identity; equal for equal identities in any process and on any machine."""
+        parts = atomic.encode(atomic.encode(as_json(self)))  # twice, as ever: old runs keep their names
+        canonical = json.dumps(parts, sort_keys=True, separators=(",", ":"), allow_nan=False)
+        return sha256(canonical.encode()).hexdigest()[:HASH_LENGTH]
+
+    @property
+    def folder_name(self) -> str:
+        """A file name that cannot leave its folder, whatever the parts are called; the digest keeps it unique."""
+        parts = (self.protocol, self.scene, self.method, self.profile, f"s{self.seed}", self.digest)
+        return "__".join(plain_name(part) for part in parts)
+
+    @property
+    def protocol_id(self) -> str:
+        """Its name without version."""
+        return self.protocol.partition("@")[0]
+
+    @property
+    def changes(self) -> dict[str, str]:
+        """What of the protocol was changed for this run: "size" -> "128"."""
+        return {name: value for name, _, value in (part.partition("=") for part in self.protocol.split("+")[1:])}
+
+    def protocol_without(self, change: str) -> str:
+        """The protocol's name but for one of its changes."""
+        return "+".join(part for part in self.protocol.split("+") if not part.startswith(f"{change}="))
+
+    @property
+    def switches(self) -> dict[str, Any]:
+        """Dotted name -> value of every switch of the method; lists are tuples."""
+        return dict(_flat({name: value for name, value in self.config.items() if name not in ("keep", "outside")}))
+
+
+@dataclass(frozen=True)
+class Subjects:
+    names: tuple[str, ...] = ()
+    standin: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Image:
+    size: Annotated[int, Within(1, 100_000)] = 0  # px; 0 where the record does not say
+
+
+@dataclass(frozen=True)
+class _ConfigShape:
+    """What is read of a recorded configuration without making the method's own of it."""
+
+    keep: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class _ProtocolShape:
+    """What is read of a recorded protocol without making a `Protocol` of it."""
+
+    subjects: Subjects = Subjects()
+    image: Image = Image()
+
+
+@dataclass(frozen=True)
+class PredictionFiles:
+    """Images that were made elsewhere and scored here."""
+
+    missing: tuple[str, ...]
+    surplus: tuple[str, ...]
+    notes: tuple[str, ...]
+    doubts: tuple[str, ...] = ()
+    folder: str = ""
+    pattern: str | None = None
+    alpha: str = ""
+    views: Count = 0  # test views that there should be images of; 0 where the record does not say
+
+
+@dataclass(frozen=True)
+class About:
+    """What a reader of the result should know. A run that failed early knows little."""
+
+    standin: str | None = None  # "" for real data
+    variant: str | None = None
+    body: str | None = None
+    headline: Words | None = None
+    protocol: Json | None = None  # the whole content
+    device: str = "cpu"
+    command: tuple[str, ...] = ()
+    label: str | None = None  # what somebody has named the row
+    predictions: PredictionFiles | None = None  # None for a run of a method
+    changed: Json | None = None  # switch -> value, of those that differ from the profile's; "keep" -> what stayed
+    left_out: tuple[Omission, ...] | None = None
+    measure: Json | None = None  # what `SceneMeasure` was then
+    hidden_share: float | None = None
+    avatar_files: tuple[str, ...] | None = None
+    fit_seconds: Seconds | None = None
+    total_seconds: Seconds | None = None
+    peak_mb: Megabytes | None = None
+    more: Json = field(default_factory=dict)
+
+    @property
+    def differences(self) -> list[str]:
+        """What sets the run apart from its profile, in words: "steps=300"."""
+        return [f"{name}={value_text(name, value)}" for name, value in (self.changed or {}).items()]
+
+    @property
+    def subjects(self) -> Subjects:
+        return from_json((self.protocol or {}).get("subjects", {}), Subjects)
+
+    @property
+    def image_size(self) -> int:
+        """px; 0 where the record does not say."""
+        return from_json((self.protocol or {}).get("image", {}), Image).size
+
+
+def value_text(name: str, value: Any) -> str:
+    """A switch's value as rows are named by it."""
+    if name == "keep":
+        return ",".join(map(str, value))
+    return str(tuple(value) if isinstance(value, list) else value)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What one stage of the ledger has cost."""
+
+    seconds: Seconds
+    cpu_seconds: float = 0.0
+    peak_mb: Megabytes = 0.0
+    peak_device_mb: Megabytes | None = 0.0
+    entered: Count = 1
+
+
+@dataclass(frozen=True)
+class LedgerState:
+    """The books of a run: see `ihbench.clock.ledger`."""
+
+    stages: Mapping[StagePath, Stage]
+    seconds: Seconds
+    cpu_seconds: float
+    events: tuple[Event, ...]
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """run.json"""
+
+    digest: Words
+    outcome: Outcome
+    identity: RunIdentity
+    about: About
+    machine: Machine
+    provenance: Provenance
+    ledger: LedgerState | None = None
+    warnings: tuple[str, ...] = ()
+    schema_version: int = SCHEMA_VERSION
+    more: Json = field(default_factory=dict)
+
+    @property
+    def events(self) -> tuple[Event, ...]:
+        return () if self.ledger is None else self.ledger.events
+
+
+@dataclass(frozen=True)
+class ScoreLine:
     """One test view of one row of scores.jsonl, calibration.jsonl or a preset's file."""
 
     row: Words
     camera: str | int
     frame: Count
-    scores: dict[str, Annotated[float, Within(-1e12, 1e12, nan=True, infinite=True)]]
-    absent: dict[str, str]
+    scores: Scores
+    absent: Mapping[str, str]  # identity -> reason
 
 
-class PresetHead(TypedDict):
+@dataclass(frozen=True)
+class PresetHead:
     """The first line of a preset's file."""
 
-    lacking: list[str]  # metrics that could not be computed
-    code: NotRequired[str]
+    lacking: tuple[str, ...]  # metrics that could not be computed
+    code: str = ""
 
 
-class CurvePoint(TypedDict):
+@dataclass(frozen=True)
+class CurvePoint:
     """One point of curve.jsonl: the quality of some test views at a moment of the fit clock."""
 
     step: Count
     seconds: Seconds
-    views: NotRequired[Count]
-    scores: dict[str, Annotated[float, Within(-1e12, 1e12, nan=True, infinite=True)]]
+    scores: Scores
+    views: Count = 0  # test views that it stands on; 0 where the file does not say
+    of: Count = 0  # of how many
+    on: tuple[str, ...] = ()  # which
+
+
+def _flat(config: Json, before: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in config.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{before}{name}.")
+        else:
+            yield before + name, tuple(value) if isinstance(value, list) else value
+
+
+def plain_name(text: str) -> str:
+    """Letters, digits and . _ + - @ only, not hidden, 48 at most."""
+    return re.sub(r"[^A-Za-z0-9._+@-]+", "-", text).strip(".-_")[:48].rstrip(".") or "unnamed"
 
 
 def read_json(file: Path, largest: int = LARGEST_RECORD) -> Any:
@@ -202,70 +295,75 @@ def read_json(file: Path, largest: int = LARGEST_RECORD) -> Any:
 
 
 def read_lines(file: Path, kind: Any) -> list[Any]:
-    """The lines of one file of a run folder, each of the type `kind`. Raises `BadInput` as `read_json` does, and for
-    a line of another shape."""
-    lines = []
+    """The lines of one file of a run folder, each as the dataclass `kind`. Raises `BadInput` as `read_json` does, and
+    for a line of another shape."""
+    return [from_json(line, kind) for line in _lines(file, lambda number: kind)]
+
+
+def score_lines(file: Path) -> list[ScoreLine]:
+    """Per-view scores in the order of the file. Raises `BadInput` as `read_lines` does, and for a view that stands
+    there twice."""
+    return _each_view_once(file, read_lines(file, ScoreLine))
+
+
+def preset_lines(file: Path) -> tuple[PresetHead, list[ScoreLine]]:
+    """What a preset's file of scores begins with, and its score lines. Raises `BadInput` as `score_lines` does."""
+    first, *lines = _lines(file, lambda number: PresetHead if number == 0 else ScoreLine) or [None]
+    if first is None:
+        raise BadInput(f"{file}: is empty")
+    return from_json(first, PresetHead), _each_view_once(file, [from_json(line, ScoreLine) for line in lines])
+
+
+def curve_points(file: Path) -> list[CurvePoint]:
+    """Quality-time points, step by step. Raises `BadInput` as `read_lines` does."""
+    return read_lines(file, CurvePoint)
+
+
+def _lines(file: Path, kind_of: Callable[[int], Any]) -> list[Any]:
+    """The JSON of the lines, of the kind that their number among the lines asks for."""
+    lines: list[Any] = []
     for number, text in enumerate(_content(file, LARGEST_TABLE).split("\n"), 1):
         if text.strip():
             line = _parsed(file, text, f", line {number}")
-            if found := fault(line, kind):
-                raise BadInput(f"{file}, line {number}: {found.lstrip('. ')}")
+            if found := fault(line, kind_of(len(lines))):
+                raise BadInput(f"{file}, line {number}: {found}")
             lines.append(line)
     return lines
 
 
-def score_lines(file: Path) -> list[Any]:
-    """Per-view scores in the order of the file. Raises `BadInput` as `read_lines` does, and for a name that is no
-    metric's identity or a view that stands there twice."""
-    return _scores(file, read_lines(file, ScoreLine))
-
-
-def preset_lines(file: Path) -> tuple[PresetHead, list[Any]]:
-    """What a preset's file of scores begins with, and its score lines. Raises `BadInput` as `score_lines` does."""
-    first, *lines = read_lines(file, Any) or [None]
-    if found := fault(first, PresetHead):
-        raise BadInput(f"{file}, line 1: {found.lstrip('. ')}")
-    for number, line in enumerate(lines, 2):
-        if found := fault(line, ScoreLine):
-            raise BadInput(f"{file}, line {number}: {found.lstrip('. ')}")
-    return first, _scores(file, lines)
-
-
-def _scores(file: Path, lines: list[Any]) -> list[Any]:
+def _each_view_once(file: Path, lines: list[ScoreLine]) -> list[ScoreLine]:
     seen = set()
     for line in lines:
-        _check_names(file, line["scores"])
-        view = line["row"], line["camera"], line["frame"]
+        view = line.row, line.camera, line.frame
         if view in seen:
-            raise BadInput(f"{file}: camera {line['camera']}, frame {line['frame']} stands twice in {line['row']}")
+            raise BadInput(f"{file}: camera {line.camera}, frame {line.frame} stands twice in {line.row}")
         seen.add(view)
     return lines
 
 
-def curve_points(file: Path) -> list[Any]:
-    """Quality-time points, step by step. Raises `BadInput` as `read_lines` does."""
-    points = read_lines(file, CurvePoint)
-    for point in points:
-        _check_names(file, point["scores"])
-    return points
-
-
 def record_fault(record: Any) -> str:
     """Where a run record of this schema version is not what it should be; "" where it is."""
-    if found := fault(record, Record):
-        return found.lstrip(". ")
+    if found := fault(record, RunRecord):
+        return found
+    for path, value, kind in (
+        ("identity.config", record["identity"]["config"], _ConfigShape),
+        ("about.protocol", record["about"].get("protocol") or {}, _ProtocolShape),
+    ):
+        if found := fault(value, kind):
+            return f"{path}.{found}"
     for name in ("load_average", "load_average_end"):
-        if (record.get("machine") or {}).get(name) == []:
+        if record["machine"].get(name) == []:
             return f"machine.{name} is empty"
     return ""
 
 
-def outcome_fault(record: Mapping[str, Any]) -> str:
+def outcome_fault(record: RunRecord) -> str:
     """What a run record lacks of what every run says, and every finished one; "" where nothing does."""
-    expected = ["standin", "variant"]
-    if record["status"] == "done":
-        expected += ["headline", "changed", "left_out", "fit_seconds", "total_seconds", "peak_mb"]
-    return next((f"about.{name} is missing" for name in expected if name not in record["about"]), "")
+    about, expected = record.about, ["standin", "variant"]
+    if record.outcome.status == "done":
+        expected += ["headline", "changed", "left_out", "total_seconds", "peak_mb"]
+        expected += ["fit_seconds"] if about.predictions is None else []
+    return next((f"about.{name} is missing" for name in expected if getattr(about, name) is None), "")
 
 
 def _content(file: Path, largest: int) -> str:
@@ -297,18 +395,3 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _refused(word: str) -> Any:
     raise ValueError(f"{word} is no JSON")
-
-
-def _check_names(file: Path, scores: Iterable[str]) -> None:
-    for name in scores:
-        if not _is_metric(name):
-            raise BadInput(f"{file}: {name[:80]!a} is no metric's identity, such as psnr/pooled/range1/full/v1")
-
-
-@lru_cache(10_000)
-def _is_metric(name: str) -> bool:
-    try:
-        MetricIdentity.parse(name)
-    except ValueError:
-        return False
-    return True

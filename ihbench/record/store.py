@@ -13,13 +13,11 @@ recorded in `run.json`, and do not make another run.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, get_args
@@ -30,13 +28,29 @@ from ihbench.clock.interruption import undisturbed
 from ihbench.clock.ledger import ARTIFACTS, Ledger
 from ihbench.errors import BadInput
 from ihbench.files import atomic, locks, removal
+from ihbench.files.shape import as_json, from_json
+from ihbench.record.migrations import MIGRATIONS
 from ihbench.record.provenance import provenance
-from ihbench.record.schema import Status, curve_points, read_json, record_fault, score_lines
+from ihbench.record.schema import (
+    HASH_LENGTH,
+    SCHEMA_VERSION,
+    About,
+    CurvePoint,
+    LedgerState,
+    Outcome,
+    RunIdentity,
+    RunRecord,
+    ScoreLine,
+    Status,
+    curve_points,
+    read_json,
+    record_fault,
+    score_lines,
+)
 
-SCHEMA_VERSION = 1
+NOTHING = About()
 STATUSES = get_args(Status)
 FINISHED = ("done", "diverged", "skipped")  # running such a run again would end the same way
-HASH_LENGTH = 10
 OUR_NAME = re.compile(f"__[0-9a-f]{{{HASH_LENGTH}}}$")  # of a run folder, even of one that has lost its record
 LOCK = "lock"
 INDEX = "runs.sqlite"  # beside the run folders
@@ -54,62 +68,16 @@ WRITTEN = {
     "renders": {".png"},  # of a number
 }  # fmt: skip
 
-Record = dict[str, Any]
-
-# schema version -> what brings a record of that version to the next one
-MIGRATIONS: dict[int, Callable[[Record], Record]] = {}
-
-
-@dataclass(frozen=True)
-class RunIdentity:
-    """Everything that affects the answer of a run, and nothing else."""
-
-    protocol: str  # id@version
-    protocol_digest: str  # hash of the protocol's content
-    dataset: str
-    scene: str
-    data: str  # which copy of the data: variant, or the stand-in's version and seed
-    method: str
-    config: Mapping[str, Any]  # every switch of the method; JSON-able
-    profile: str
-    seed: int
-    body: str  # hash of the body model
-    code: str  # version, hash of the method's code, hash of the bench's: see `source_digest`
-
-    @property
-    def digest(self) -> str:
-        """Hex digits that name this identity; equal for equal identities in any process and on any machine."""
-        return identity_digest(atomic.encode(self))
-
-    @property
-    def folder_name(self) -> str:
-        """A file name that cannot leave its folder, whatever the parts are called; the digest keeps it unique."""
-        parts = (self.protocol, self.scene, self.method, self.profile, f"s{self.seed}", self.digest)
-        return "__".join(plain_name(part) for part in parts)
-
-
-def identity_digest(identity: Mapping[str, Any]) -> str:
-    """The digest of an identity as a record holds it, whatever fields the version had that wrote it."""
-    canonical = json.dumps(atomic.encode(identity), sort_keys=True, separators=(",", ":"), allow_nan=False)
-    return hashlib.sha256(canonical.encode()).hexdigest()[:HASH_LENGTH]
-
-
-def plain_name(text: str) -> str:
-    """Letters, digits and . _ + - @ only, not hidden, 48 at most."""
-    return re.sub(r"[^A-Za-z0-9._+@-]+", "-", text).strip(".-_")[:48].rstrip(".") or "unnamed"
-
 
 class RunFolder:
     """One run on disk. `create` opens it for writing, `open` for reading."""
 
-    def __init__(self, path: Path, record: Record) -> None:
+    def __init__(self, path: Path, record: RunRecord) -> None:
         self.path = path
         self.record = record
 
     @classmethod
-    def create(
-        cls, runs: Path, identity: RunIdentity, about: Mapping[str, Any] | None = None, force: bool = False
-    ) -> RunFolder:
+    def create(cls, runs: Path, identity: RunIdentity, about: About = NOTHING, force: bool = False) -> RunFolder:
         """The folder of this run, new or as an earlier process left it.
 
         A finished run is found, not begun again (see `finished`); one that was cut short keeps its checkpoints and
@@ -132,39 +100,27 @@ class RunFolder:
             raise
 
     @classmethod
-    def _there(cls, path: Path, identity: RunIdentity, about: Mapping[str, Any] | None) -> RunFolder:
+    def _there(cls, path: Path, identity: RunIdentity, about: About) -> RunFolder:
         """The run as `create` finds or begins it."""
-        warnings = []
+        warnings: tuple[str, ...] = ()
         if (path / "run.json").exists():
             try:
                 run = cls.open(path)
             except DamagedRecord as damage:
                 damaged = _free_name(path / "run.json.damaged")
                 os.rename(path / "run.json", damaged)
-                warnings.append(f"run.json was damaged and the run started again: {damage}")
+                warnings = (f"run.json was damaged and the run started again: {damage}",)
             else:
-                if run.record["identity"] != _as_read(identity):
+                if run.record.digest != identity.digest:
                     raise BadInput(
                         f"{path}: holds another run under the same name; move that folder away and run again"
                     )
                 return run
-        run = cls(
-            path,
-            {
-                "schema_version": SCHEMA_VERSION,
-                "status": "running",
-                "reason": "",
-                "digest": identity.digest,
-                "identity": _as_read(identity),
-                "about": dict(about or {}),
-                "created": _now(),
-                "updated": _now(),
-                "provenance": provenance(),
-                "machine": machine.identity(),
-                "ledger": None,
-                "warnings": warnings,
-            },
+        outcome = Outcome("running", "", created=_now())
+        record = RunRecord(
+            identity.digest, outcome, identity, about, machine.identity(), provenance(), warnings=warnings
         )
+        run = cls(path, from_json(atomic.decode(atomic.encode(as_json(record))), RunRecord))  # as it is read again
         run.save()
         return run
 
@@ -183,16 +139,20 @@ class RunFolder:
     # --- what it says ---
 
     @property
-    def identity(self) -> Record:
-        return self.record["identity"]
+    def identity(self) -> RunIdentity:
+        return self.record.identity
 
     @property
-    def status(self) -> str:
-        return self.record["status"]
+    def about(self) -> About:
+        return self.record.about
+
+    @property
+    def status(self) -> Status:
+        return self.record.outcome.status
 
     @property
     def reason(self) -> str:
-        return self.record["reason"]
+        return self.record.outcome.reason
 
     @property
     def finished(self) -> bool:
@@ -207,12 +167,12 @@ class RunFolder:
     def checkpoints(self) -> Path:
         return self.path / "checkpoints"
 
-    def scores(self) -> list[Record]:
+    def scores(self) -> list[ScoreLine]:
         """Rows of scores.jsonl; none when nothing was scored. Raises `BadInput` for a damaged file."""
         file = self.path / "scores.jsonl"
         return score_lines(file) if os.path.lexists(file) else []
 
-    def curve(self) -> list[Record]:
+    def curve(self) -> list[CurvePoint]:
         """Quality-time points in order. Raises `BadInput` for a damaged file."""
         file = self.path / "curve.jsonl"
         return curve_points(file) if os.path.lexists(file) else []
@@ -220,34 +180,46 @@ class RunFolder:
     def notice_death(self) -> None:
         """Of a run that says it is running, and that nobody is writing, know that it was interrupted."""
         if self.status == "running" and not locks.is_held(self.path / LOCK):
-            self.record |= {"status": "interrupted", "reason": KILLED}
+            self._change(outcome=replace(self.record.outcome, status="interrupted", reason=KILLED))
 
     # --- writing ---
 
-    def set_status(self, status: str, reason: str = "", ledger: Ledger | None = None) -> None:
+    def set_status(
+        self, status: Status, reason: str = "", ledger: Ledger | None = None, step: int | None = None
+    ) -> None:
         """Write the outcome, and the ledger's books with it. Raises `ValueError` for an unknown status."""
         if status not in STATUSES:
             raise ValueError(f"run status: expected one of {', '.join(STATUSES)}, got {status!r}")
-        self.record["status"], self.record["reason"] = status, reason
+        self._change(outcome=replace(self.record.outcome, status=status, reason=reason, step=step))
         if ledger is not None:
-            self.record["ledger"] = {**ledger.state(), "table": ledger.table()}
+            self._change(ledger=from_json(as_json(ledger.state()), LedgerState))
         self.save()
+
+    def describe(self, **about: Any) -> None:
+        """Put more into what a reader should know; `save` writes it."""
+        self._change(about=replace(self.about, **about))
+
+    def note_machine(self, at: machine.Machine) -> None:
+        self._change(machine=at)
 
     def warn(self, text: str) -> None:
         """Note something the reader of the result should know; once."""
-        if text not in self.record["warnings"]:
-            self.record["warnings"].append(text)
+        if text not in self.record.warnings:
+            self._change(warnings=(*self.record.warnings, text))
             self.save()
 
     def save(self) -> None:
         """Write run.json. Machine and versions are those of the process that wrote it last."""
-        self.record["updated"] = _now()
-        atomic.write_json(self.path / "run.json", self.record)
+        self._change(outcome=replace(self.record.outcome, updated=_now()))
+        atomic.write_json(self.path / "run.json", {"schema_version": SCHEMA_VERSION, **as_json(self.record)})
 
     def restarted(self) -> None:
         """Mark a run that is continued as running, on this machine with these versions."""
-        self.record["provenance"], self.record["machine"] = provenance(), machine.identity()
+        self._change(provenance=provenance(), machine=machine.identity())
         self.set_status("running")
+
+    def _change(self, **parts: Any) -> None:
+        self.record = replace(self.record, **parts)
 
     @contextmanager
     def saving_avatar(self) -> Iterator[None]:
@@ -260,26 +232,26 @@ class RunFolder:
 
         before = state()
         yield
-        known = self.record["about"].get("avatar_files", [])
+        known = self.about.avatar_files or ()
         changed = [name for name, stat in state().items() if before.get(name) != stat]
-        self.record["about"]["avatar_files"] = sorted({*known, *changed})
+        self.describe(avatar_files=tuple(sorted({*known, *changed})))
 
-    def write_scores(self, rows: list[Record]) -> None:
+    def write_scores(self, rows: Sequence[ScoreLine]) -> None:
         """Replace scores.jsonl: one row for each test view."""
-        atomic.write_json_lines(self.path / "scores.jsonl", rows)
+        atomic.write_json_lines(self.path / "scores.jsonl", as_json(rows))
 
-    def add_curve_point(self, point: Record) -> None:
-        """Append a quality-time point, `{"step": ..., "seconds": ..., ...}`.
+    def add_curve_point(self, point: CurvePoint) -> None:
+        """Append a quality-time point.
 
         Points of this step or later are dropped: a resumed fit makes them again. A damaged file begins anew, with a
         warning: the fit does not depend on it.
         """
         try:
-            kept = [earlier for earlier in self.curve() if earlier["step"] < point["step"]]
+            kept = [earlier for earlier in self.curve() if earlier.step < point.step]
         except BadInput as damage:
             kept = []
             self.warn(f"earlier points of the quality-time curve are lost: {damage}")
-        atomic.write_json_lines(self.path / "curve.jsonl", [*kept, point])
+        atomic.write_json_lines(self.path / "curve.jsonl", as_json([*kept, point]))
 
     def settle(self, keep_new: bool) -> None:
         """End a forced run: forget the finished run it replaces, or bring that one back. Call it inside `lock()`."""
@@ -330,7 +302,7 @@ class DamagedRecord(BadInput):
     """A run.json that is there and cannot be used."""
 
 
-def _checked(file: Path, record: Any) -> Record:
+def _checked(file: Path, record: Any) -> RunRecord:
     """The record brought to this schema version. Raises `BadInput` for a newer one, `DamagedRecord` for no record."""
     version = record.get("schema_version") if isinstance(record, dict) else None
     if not isinstance(version, int) or isinstance(version, bool) or version < 1:
@@ -340,13 +312,14 @@ def _checked(file: Path, record: Any) -> Record:
             f"{file}: written by a newer ihbench (schema {version}, this one knows {SCHEMA_VERSION}); update ihbench"
         )
     while version < SCHEMA_VERSION:
-        record = MIGRATIONS[version](record)
-        version += 1
+        version, record = version + 1, MIGRATIONS[version](record)
+    record = {**record, "schema_version": version}
     if found := record_fault(record):
         raise DamagedRecord(f"{file}: {found}; run the same command with --force")
-    if identity_digest(atomic.encode(record["identity"])) != record["digest"]:
+    read: RunRecord = from_json(record, RunRecord)
+    if read.identity.digest != read.digest:
         raise BadInput(f"{file}: its identity is not the one of its digest: edited, or of another run; restore it")
-    return record
+    return read
 
 
 def _free_name(path: Path) -> Path:
@@ -355,11 +328,6 @@ def _free_name(path: Path) -> Path:
     while os.path.lexists(free):
         number, free = number + 1, path.with_name(f"{path.name}-{number + 1}")
     return free
-
-
-def _as_read(identity: RunIdentity) -> Record:
-    """The identity as it comes back from JSON, so that the two can be compared."""
-    return atomic.decode(json.loads(json.dumps(atomic.encode(identity))))
 
 
 def _locked(path: Path) -> AbstractContextManager[None]:
@@ -423,7 +391,7 @@ def _written_in(folder: Path) -> removal.Ours:
     """`_is_ours` of one run folder. Where a method or the user chooses the name, the record or the file itself says
     who wrote it."""
     try:
-        avatar = RunFolder.open(folder).record["about"].get("avatar_files")
+        avatar = RunFolder.open(folder).about.avatar_files
     except BadInput:
         avatar = None  # as of a run of version 0.1: all that has such a name
 

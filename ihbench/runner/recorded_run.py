@@ -5,10 +5,10 @@ from __future__ import annotations
 import gc
 import traceback
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ihbench.clock import machine
 from ihbench.clock.events import DivergedAt, Event, Resumed
@@ -18,10 +18,16 @@ from ihbench.clock.ledger import Ledger, OnCheckpoint
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput, Diverged
 from ihbench.files import atomic, removal
+from ihbench.files.shape import as_json
 from ihbench.record.results import TRACEBACK, RunResult, read_result
-from ihbench.record.store import RunFolder, RunIdentity, note_interruption
+from ihbench.record.schema import About, RunIdentity, Status
+from ihbench.record.store import RunFolder, note_interruption
+from ihbench.scene.capture_digest import capture_digest
 from ihbench.scene.contracts import Capture
 from ihbench.scene.protocol import Protocol
+
+if TYPE_CHECKING:
+    from ihbench.body import Body
 
 
 class RecordedRun(ABC):
@@ -35,9 +41,10 @@ class RecordedRun(ABC):
         on_checkpoint: OnCheckpoint | None = None,
     ):
         self.folder, self.progress = folder, progress
-        before = folder.record["ledger"]
+        before = folder.record.ledger
+        state = None if before is None else as_json(before)
         self.ledger = Ledger(
-            folder.path, device=device, state=before, on_checkpoint=on_checkpoint, on_event=self._say_where
+            folder.path, device=device, state=state, on_checkpoint=on_checkpoint, on_event=self._say_where
         )
         if before is not None:
             if not any(folder.checkpoints.glob("*.safetensors")):
@@ -58,7 +65,7 @@ class RecordedRun(ABC):
             match outcome:
                 case Diverged():
                     self.ledger.event(DivergedAt(outcome.step, outcome.reason))
-                    self._end("diverged", str(outcome))
+                    self._end("diverged", str(outcome), step=outcome.step)
                 case BadInput():
                     self._end("failed", str(outcome))
                     raise
@@ -72,13 +79,13 @@ class RecordedRun(ABC):
                 case _:
                     raise
 
-    def _end(self, status: str, reason: str, details: str = "") -> None:
+    def _end(self, status: Status, reason: str, details: str = "", step: int | None = None) -> None:
         with undisturbed():
             self.describe()
             try:
                 if details:
                     atomic.write_text(self.folder.path / TRACEBACK, details)
-                self.folder.set_status(status, reason, self.ledger)
+                self.folder.set_status(status, reason, self.ledger, step)
             except (BadInput, OSError) as error:  # the disk that failed the run may fail its record too
                 self.progress.say(f"the run's record could not be written: {error}")
 
@@ -89,20 +96,17 @@ class RecordedRun(ABC):
 
     def describe(self, **more: Any) -> None:
         """Put the clocks, the peak memory, what the machine has turned out to be, and more into the record."""
-        self.folder.record["machine"] = machine.identity_at_end(self.folder.record["machine"])
+        self.folder.note_machine(self.folder.record.machine.at_end())
         # an earlier process of this run, or the run that lent a stage, may have held more
         stages = [row["peak_mb"] for row in self.ledger.table()]
-        self.folder.record["about"] |= {
-            "fit_seconds": self.ledger.fit_seconds,
-            "total_seconds": self.ledger.seconds,
-            "peak_mb": max([*stages, machine.peak_memory_mb()]),
-        } | more
+        clocks = {"fit_seconds": self.ledger.fit_seconds, "total_seconds": self.ledger.seconds}
+        self.folder.describe(**{**clocks, "peak_mb": max([*stages, machine.peak_memory_mb()]), **more})
 
 
 def recorded(
     runs: Path,
     identity: RunIdentity,
-    about: Mapping[str, Any],
+    about: About,
     force: bool,
     make: Callable[[RunFolder], RecordedRun],
 ) -> RunResult:
@@ -142,12 +146,33 @@ def _begun(folder: RunFolder, make: Callable[[RunFolder], RecordedRun]) -> None:
                 folder.settle(keep)
 
 
-def about_scene(capture: Capture, protocol: Protocol) -> dict[str, Any]:
+def about_scene(capture: Capture, protocol: Protocol, device: str, command: Sequence[str]) -> About:
     """What the record of any run on a scene says of it. The protocol's whole content makes a run folder complete."""
-    return {
-        "standin": capture.standin,
-        "variant": capture.variant,
-        "body": capture.body,
-        "headline": protocol.metrics.headline,
-        "protocol": protocol.content,
-    }
+    return About(
+        standin=capture.standin,
+        variant=capture.variant,
+        body=capture.body,
+        headline=protocol.metrics.headline,
+        protocol=protocol.content,
+        device=device,
+        command=tuple(command),
+    )
+
+
+def identity_of(
+    protocol: Protocol, capture: Capture, body: Body, method: str, config: Mapping[str, Any], seed: int, code: str
+) -> RunIdentity:
+    """Everything that affects the answer of a run on a scene."""
+    return RunIdentity(
+        protocol=protocol.name,
+        protocol_digest=protocol.digest,
+        dataset=capture.dataset,
+        scene=capture.name,
+        data=f"{capture.standin or capture.variant} {capture_digest(capture, protocol)}",
+        method=method,
+        config=config,
+        profile=protocol.profile,
+        seed=seed,
+        body=body.content_sha(),
+        code=code,
+    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,9 +12,6 @@ from ihbench.record.reopen import reopen_protocol
 from ihbench.record.results import RunResult, read_result
 from ihbench.record.store import RunFolder
 from ihbench.runner.run_loop import RunRequest, configuration
-from ihbench.runner.score_predictions import MADE_ELSEWHERE
-
-NOT_SWITCHES = ("keep", "outside")  # of a recorded configuration
 
 
 @dataclass(frozen=True)
@@ -31,28 +27,21 @@ def repetition(folder: Path, runs: Path, body: Path | None, device: str, force: 
 
     Raises `BadInput` for a folder that holds no run, scored predictions, and a method with other switches by now.
     """
-    record = RunFolder.open(folder).record
-    identity = record["identity"]
-    if record["about"].get("provenance") == MADE_ELSEWHERE:
+    run = RunFolder.open(folder)
+    identity = run.identity
+    if run.about.predictions is not None:
         raise BadInput(f"{folder}: holds scored images, not a run of a method; repeat it with ihbench score")
-    try:
-        method, profile, scene, seed = (identity[name] for name in ("method", "profile", "scene", "seed"))
-        stored = dict(identity["config"])
-        keep = tuple(stored.get("keep", ()))
-        switches = dict(_flat({name: value for name, value in stored.items() if name not in NOT_SWITCHES}))
-    except (KeyError, TypeError, ValueError) as error:
-        raise BadInput(f"{folder}: its run.json does not say what was run ({error!r})") from error
-    config = configuration(method, profile, {})
+    method, switches = identity.method, identity.switches
+    config = configuration(method, identity.profile, {})
     unknown = sorted(switches.keys() - flat(config).keys())
     if unknown:
         raise BadInput(
             f"{folder}: was run with --method.{unknown[0].replace('_', '-')}, which {method} does not have here; "
-            f"its code was {identity.get('code')}"
+            f"its code was {identity.code}"
         )
-    request = RunRequest(
-        reopen_protocol(folder), method, with_fields(config, switches), seed, device, runs, body, force, keep
-    )
-    return Repetition(request, scene)
+    config, keep = with_fields(config, switches), tuple(identity.config.get("keep", ()))
+    request = RunRequest(reopen_protocol(folder), method, config, identity.seed, device, runs, body, force, keep)
+    return Repetition(request, identity.scene)
 
 
 def differences(folder: Path, result: RunResult) -> list[str]:
@@ -62,29 +51,20 @@ def differences(folder: Path, result: RunResult) -> list[str]:
     there = read_result(folder)
     lines = []
     for name in ("code", "data", "body"):
-        lines += _change(name, there.identity.get(name), result.identity.get(name))
-    lines += _change("outside files", *(r.identity["config"].get("outside") for r in (there, result)))
-    before, now = (r.record.get("provenance", {}).get("packages", {}) for r in (there, result))
+        lines += _change(name, getattr(there.identity, name), getattr(result.identity, name))
+    lines += _change("outside files", *(r.identity.config.get("outside") for r in (there, result)))
+    before, now = (r.record.provenance.packages for r in (there, result))
     for name in sorted(before.keys() | now.keys()):
         lines += _change(name, before.get(name), now.get(name))
     for name in ("cpu", "gpu", "python"):
-        lines += _change(name, *(r.record.get("machine", {}).get(name) for r in (there, result)))
-    old, new = (r.rows.get(r.method, {}) for r in (there, result))
-    for identity in sorted(old.keys() | new.keys()):
+        lines += _change(name, *(getattr(r.record.machine, name) for r in (there, result)))
+    old, new = there.own, result.own
+    for identity in sorted(old.keys() | new.keys(), key=str):
         values = [rows[identity].value if identity in rows else None for rows in (old, new)]
         if values[0] != values[1] and not all(value is None or value != value for value in values):
-            lines += _change(identity, *values)
+            lines += _change(str(identity), *values)
     return lines or [f"{folder}: the same code, data and versions, and the same scores to the last bit"]
 
 
 def _change(name: str, before: Any, now: Any) -> list[str]:
     return [] if before == now else [f"{name}: {before} there, {now} here"]
-
-
-def _flat(config: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted names and values of a configuration as JSON has it; lists are tuples again."""
-    for name, value in config.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{before}{name}.")
-        else:
-            yield before + name, tuple(value) if isinstance(value, list) else value

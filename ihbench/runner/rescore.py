@@ -15,10 +15,11 @@ from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.images import read_image
+from ihbench.files.shape import as_json
 from ihbench.metrics.evaluate import Preset, find_preset
 from ihbench.record.reopen import reopen_protocol, reopen_scene
 from ihbench.record.results import view_rows
-from ihbench.record.schema import preset_lines
+from ihbench.record.schema import PresetHead, preset_lines
 from ihbench.record.source_digest import bench_code
 from ihbench.record.store import RunFolder
 from ihbench.runner.score_stage import ScoreStage, render_path
@@ -41,7 +42,7 @@ def rescore(folder: Path, preset: str, data: Path | None, body: Path | None, pro
         return
     scene, _ = reopen_scene(folder, data, body)
     scorer = Scorer.build(scene, [chosen.name])
-    name = run.identity["method"]
+    name = run.identity.method
     rows = {name: lambda loaded: _render(run, loaded)}
     rows |= ScoreStage(scorer, run, folder.parent, progress).calibration_rows()
     results: dict[str, list[ViewScores]] = {row: [] for row in rows}
@@ -51,7 +52,7 @@ def rescore(folder: Path, preset: str, data: Path | None, body: Path | None, pro
                 results[row].append(scores)
             task.advance()
         lines = [line for row, scores in results.items() for line in view_rows(row, scores)]
-        atomic.write_json_lines(file, [{"lacking": list(chosen.lacking()), "code": code}, *lines])
+        atomic.write_json_lines(file, as_json([PresetHead(tuple(chosen.lacking()), code), *lines]))
 
 
 def _render(run: RunFolder, loaded: LoadedView) -> NDArray | None:
@@ -66,4 +67,4 @@ def _stands(file: Path, preset: Preset, code: str) -> bool:
         head, _ = preset_lines(file)
     except BadInput:  # damaged: the renders are there to be scored again
         return False
-    return head.get("code") == code and set(head["lacking"]) <= set(preset.lacking())
+    return head.code == code and set(head.lacking) <= set(preset.lacking())

@@ -20,19 +20,19 @@ from numpy.typing import NDArray
 
 from ihbench import config_fields, registry
 from ihbench.clock import machine
-from ihbench.clock.events import Event, Reused
+from ihbench.clock.events import Reused
 from ihbench.clock.progress import Progress
 from ihbench.config_fields import SEEDS, flat, with_fields
 from ihbench.errors import BadInput
-from ihbench.metrics import mean_over_frames
+from ihbench.metrics import Identity, mean_over_frames
 from ihbench.record.provenance import command
 from ihbench.record.reopen import reopen_body, reopen_capture
 from ihbench.record.results import RunResult
+from ihbench.record.schema import CurvePoint, RunIdentity
 from ihbench.record.source_digest import code_of, shipped_digest
-from ihbench.record.store import RunFolder, RunIdentity, is_finished
-from ihbench.runner.recorded_run import RecordedRun, about_scene, recorded
+from ihbench.record.store import RunFolder, is_finished
+from ihbench.runner.recorded_run import RecordedRun, about_scene, identity_of, recorded
 from ihbench.runner.score_stage import ScoreStage
-from ihbench.scene.capture_digest import capture_digest
 from ihbench.scene.contracts import Avatar, Capture, TestView
 from ihbench.scene.data_source import DataSource
 from ihbench.scene.method_spec import method_spec
@@ -83,10 +83,7 @@ def run_scene(request: RunRequest, source: DataSource, scene: str, progress: Pro
     clock = _Clock()
     capture, body = source.open(scene, request.body, progress)
     identity = run_identity(request, capture, body)
-    about = about_scene(capture, request.protocol) | {
-        "device": request.device,
-        "command": list(request.command),
-    }
+    about = about_scene(capture, request.protocol, request.device, request.command)
     before = {"open": clock.lap()}
     occluded = None
     if request.force or not is_finished(request.runs, identity):
@@ -116,29 +113,18 @@ class _Clock:
 
 def run_identity(request: RunRequest, capture: Capture, body: Body) -> RunIdentity:
     """Everything that affects the answer."""
-    return RunIdentity(
-        protocol=request.protocol.name,
-        protocol_digest=request.protocol.digest,
-        dataset=capture.dataset,
-        scene=capture.name,
-        data=f"{capture.standin or capture.variant} {capture_digest(capture, request.protocol)}",
-        method=request.method,
-        config={**asdict(request.config), "keep": list(request.keep), **_outside(request)},
-        profile=request.protocol.profile,
-        seed=request.seed,
-        body=body.content_sha(),
-        code=code_of(request.protocol, request.method),
-    )
+    config = {**asdict(request.config), "keep": list(request.keep), **_outside(request)}
+    code = code_of(request.protocol, request.method)
+    return identity_of(request.protocol, capture, body, request.method, config, request.seed, code)
 
 
 def load_avatar(folder: Path, data: Path | None, body: Path | None) -> tuple[Any, Callable[[], Capture]]:
     """The avatar of a run, and a function that opens the run's capture for its poses."""
-    record = RunFolder.open(folder).record
+    run = RunFolder.open(folder)
     if not (folder / "avatar").is_dir():
-        raise BadInput(f"{folder}: has no avatar (status {record['status']}); finish the run first")
-    identity, model = record["identity"], reopen_body(folder, data, body)
-    spec = method_spec(identity["method"])
-    method = spec.create(spec.profile(identity["profile"]))
+        raise BadInput(f"{folder}: has no avatar (status {run.status}); finish the run first")
+    spec, model = method_spec(run.identity.method), reopen_body(folder, data, body)
+    method = spec.create(spec.profile(run.identity.profile))
     return method.load(folder / "avatar", model), lambda: reopen_capture(folder, data, body)
 
 
@@ -180,7 +166,7 @@ class _Run(RecordedRun):
             self.scorer = Scorer.build(scene)
         self.describe(
             changed=_changed(request, withheld),
-            left_out=[asdict(o) for o in left_out],
+            left_out=tuple(left_out),
             measure=asdict(measure),
             hidden_share=hidden_share,
         )
@@ -209,9 +195,8 @@ class _Run(RecordedRun):
         for state, free in method_spec(self.request.method).shared_states.items():
             other = lender(self.request.runs, self.folder, state, free, machine.identity())
             if other is not None:
-                went_back = lend(other, self.folder, state)  # or whatever else happened to it
-                self.ledger.events += [Event.of(row) for row in went_back]
-                self.ledger.event(Reused(state, other.record["digest"]))
+                self.ledger.events += lend(other, self.folder, state)  # that it went back, say
+                self.ledger.event(Reused(state, other.record.digest))
 
     def _render(self, avatar: Avatar, view: TestView) -> NDArray[np.float32]:
         background, frames = self.request.protocol.image.background, self.occluded.hiding.frames
@@ -224,9 +209,10 @@ class _Run(RecordedRun):
         chosen, keys = self._curve_views, self.scorer.scene.test_keys
         rows = {"now": lambda loaded: self._render(avatar, loaded.view)}
         views = [scored.scores["now"].scores for scored in self.scorer.scored(rows, chosen, slow=False)]
-        scores = {i: mean_over_frames([view[i] for view in views]).value for i in views[0]}
-        where = {"views": len(chosen), "of": sum(not key.group for key in keys), "on": [keys[k].name for k in chosen]}
-        self.folder.add_curve_point({"step": step, "seconds": seconds, **where, "scores": scores})
+        scores = {Identity.parse(i): mean_over_frames([view[i] for view in views]).value for i in views[0]}
+        on = tuple(keys[k].name for k in chosen)
+        of = sum(not key.group for key in keys)
+        self.folder.add_curve_point(CurvePoint(step, seconds, scores, len(chosen), of, on))
 
     @cached_property
     def _curve_views(self) -> list[int]:
@@ -246,12 +232,12 @@ def _planned(request: RunRequest, measure: SceneMeasure) -> tuple[Any, list[Omis
     return config, taken + absent_regions(measure, request.protocol.metrics.regions), withheld
 
 
-def _changed(request: RunRequest, withheld: list[str]) -> list[str]:
-    """What sets the run apart from the profile, for table rows: switches, and what the plan was not let to leave out
-    (a `keep` that changed nothing is no difference)."""
+def _changed(request: RunRequest, withheld: list[str]) -> dict[str, Any]:
+    """What sets the run apart from the profile: switches with their values, and as "keep" what the plan was not let
+    to leave out (a `keep` that changed nothing is no difference)."""
     base = flat(method_spec(request.method).profile(request.protocol.profile))
-    changed = [f"{name}={value}" for name, value in flat(request.config).items() if value != base[name]]
-    return [*changed, f"keep={','.join(withheld)}"] if withheld else changed
+    changed = {name: value for name, value in flat(request.config).items() if value != base[name]}
+    return {**changed, "keep": withheld} if withheld else changed
 
 
 def _outside(request: RunRequest) -> dict[str, str]:

@@ -10,11 +10,11 @@ from ihbench.clock.progress import Progress
 from ihbench.data.prepared import Prepared
 from ihbench.record.provenance import command
 from ihbench.record.results import RunResult, read_result
+from ihbench.record.schema import PredictionFiles
 from ihbench.record.source_digest import bench_code
-from ihbench.record.store import RunFolder, RunIdentity
-from ihbench.runner.recorded_run import RecordedRun, about_scene, recorded
+from ihbench.record.store import RunFolder
+from ihbench.runner.recorded_run import RecordedRun, about_scene, identity_of, recorded
 from ihbench.runner.score_stage import ScoreStage
-from ihbench.scene.capture_digest import capture_digest
 from ihbench.scene.data_source import DataSource
 from ihbench.scene.protocol import Protocol
 from ihbench.scene.views import OccludedScene, open_scene
@@ -25,8 +25,6 @@ from ihbench.version import __version__
 
 if TYPE_CHECKING:
     from ihbench.body import Body
-
-MADE_ELSEWHERE = "predictions"  # where a method's run has been made here
 
 
 @dataclass(frozen=True)
@@ -53,35 +51,21 @@ def score_scene(request: ScoreRequest, source: DataSource, scene: str, progress:
     found = find_predictions(request.folder, scene, opened.test_keys, request.pattern, source.scenes)
     background = request.protocol.image.background
     found = replace(found, alpha=find_alpha(list(found.files.values()), background, request.alpha))
-    identity = RunIdentity(
-        protocol=request.protocol.name,
-        protocol_digest=request.protocol.digest,
-        dataset=capture.dataset,
-        scene=capture.name,
-        data=f"{capture.standin or capture.variant} {capture_digest(capture, request.protocol)}",
-        method=request.name,
-        config={"predictions": found.digest},
-        profile=request.protocol.profile,
-        seed=0,
-        body=body.content_sha(),
-        code=f"{__version__}+{bench_code(request.protocol)}",
+    code = f"{__version__}+{bench_code(request.protocol)}"
+    config = {"predictions": found.digest}
+    identity = identity_of(request.protocol, capture, body, request.name, config, 0, code)
+    files = PredictionFiles(
+        found.missing,
+        found.surplus,
+        tuple(found.notes()),
+        folder=request.folder.resolve().name,
+        pattern=found.pattern,
+        alpha=found.alpha,
+        views=len(opened.test_keys),
     )
-    about = about_scene(capture, request.protocol) | {
-        "device": "cpu",
-        "command": list(command()),
-        "provenance": MADE_ELSEWHERE,
-        "predictions": {
-            "folder": request.folder.resolve().name,
-            "pattern": found.pattern,
-            "missing": list(found.missing),
-            "surplus": list(found.surplus),
-            "alpha": found.alpha,
-            "views": len(opened.test_keys),
-            "notes": found.notes(),
-        },
-        "changed": [],
-        "left_out": [],
-    }
+    about = replace(
+        about_scene(capture, request.protocol, "cpu", command()), predictions=files, changed={}, left_out=()
+    )
     result = recorded(
         request.runs,
         identity,
@@ -89,12 +73,13 @@ def score_scene(request: ScoreRequest, source: DataSource, scene: str, progress:
         request.force,
         lambda folder: _ScoreRun(request, found, opened, body, folder, progress),
     )
-    about["predictions"]["doubts"] = result.record["about"]["predictions"].get("doubts", [])
-    if result.record["about"]["predictions"] == about["predictions"]:
+    before = result.about.predictions
+    files = replace(files, doubts=() if before is None else before.doubts)
+    if before == files:
         return result
     folder = RunFolder.open(result.folder)  # the same images were scored before, beside other stray files
     with folder.lock():
-        folder.record["about"]["predictions"] = about["predictions"]
+        folder.describe(predictions=files)
         folder.save()
     return read_result(result.folder)
 
@@ -129,6 +114,8 @@ class _ScoreRun(RecordedRun):
                 threaded=True,
                 look=doubts.look,
             )
-            self.folder.record["about"]["predictions"]["doubts"] = doubts.notes()
+            files = self.folder.about.predictions
+            if files is not None:
+                self.folder.describe(predictions=replace(files, doubts=tuple(doubts.notes())))
         self.describe(hidden_share=self.scene.hiding.hidden_share(), fit_seconds=None)
         self.folder.set_status("done", ledger=self.ledger)

@@ -6,7 +6,6 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +14,10 @@ from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.images import write_png
+from ihbench.files.shape import as_json
 from ihbench.metrics.eight_bit import displayed
 from ihbench.record.results import group_row, view_rows
-from ihbench.record.schema import score_lines
+from ihbench.record.schema import ScoreLine, score_lines
 from ihbench.record.source_digest import bench_code
 from ihbench.record.store import RunFolder
 from ihbench.scene.spread import spread
@@ -75,11 +75,11 @@ class ScoreStage:
                 task.advance()
         if kept is None:
             kept = [line for row in ROWS for line in view_rows(row, results[row])]
-            atomic.write_json_lines(self._calibration_file(), kept)
-        atomic.write_json_lines(self.folder.path / "calibration.jsonl", kept)
+            atomic.write_json_lines(self._calibration_file(), as_json(kept))
+        atomic.write_json_lines(self.folder.path / "calibration.jsonl", as_json(kept))
         self.folder.write_scores(view_rows(name, results[name]))
         identity, capture = self.folder.identity, scene.capture
-        title = f"{identity['protocol']}  {capture.name}  {name}  {scene.protocol.profile}"
+        title = f"{identity.protocol}  {capture.name}  {name}  {scene.protocol.profile}"
         if capture.standin:
             title += f"  ({capture.standin})"
         zoom = max(1, SHEET_SIZE // scene.protocol.image.size)
@@ -90,7 +90,7 @@ class ScoreStage:
         calibration = Calibration.build(self.scorer.scene.training)
         return {row: (lambda loaded, row=row: calibration.predict(row, loaded.view)) for row in ROWS}
 
-    def _kept_calibration(self) -> list[dict[str, Any]] | None:
+    def _kept_calibration(self) -> list[ScoreLine] | None:
         """Rows that an earlier run on the same data has computed. A damaged file is computed again."""
         file = self._calibration_file()
         if self.force or not file.is_file():
@@ -105,12 +105,12 @@ class ScoreStage:
             for row in ROWS
             for key in self.scorer.scene.test_keys
         }
-        return lines if {(line["row"], line["camera"], line["frame"]) for line in lines} == views else None
+        return lines if {(line.row, line.camera, line.frame) for line in lines} == views else None
 
     def _calibration_file(self) -> Path:
         """Calibration rows depend on data, protocol and the bench's code only: computed once for all runs."""
         identity, protocol = self.folder.identity, self.scorer.scene.protocol
-        parts = [bench_code(protocol), *(identity[k] for k in ("protocol_digest", "scene", "data", "body"))]
+        parts = [bench_code(protocol), identity.protocol_digest, identity.scene, identity.data, identity.body]
         for preset in self.scorer.presets:
             parts += [*preset.identities(protocol.metrics.regions, protocol.image.background), *preset.lacking()]
         digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from ihbench.clock.checkpoints import saved_meta, state_file
+from ihbench.clock.events import Event
+from ihbench.clock.machine import Machine
 from ihbench.errors import BadInput
 from ihbench.files import atomic
+from ihbench.files.shape import as_json
+from ihbench.record.schema import RunIdentity
 from ihbench.record.store import RunFolder
 
 SAME_CLOCK = ("cpu", "gpu", "torch_threads")  # of a machine's identity: the state's seconds come with it
 
 
-def lender(
-    runs: Path, borrower: RunFolder, state: str, free: Sequence[str], here: Mapping[str, Any]
-) -> RunFolder | None:
+def lender(runs: Path, borrower: RunFolder, state: str, free: Sequence[str], here: Machine) -> RunFolder | None:
     """A finished run under `runs` that has `state`, was made on such a machine as `here` with as many threads, and
     whose identity differs from the borrower's at most in configuration fields whose names begin with one of `free`;
     None when there is none, or nothing is missing."""
@@ -29,25 +31,24 @@ def lender(
                 other = RunFolder.open(file.parent.parent)
             except BadInput:
                 continue  # a damaged record vouches for nothing
-            there = other.record.get("machine") or {}
-            alike = all(there.get(name) == here.get(name) for name in SAME_CLOCK)
+            there = other.record.machine
+            alike = all(getattr(there, name) == getattr(here, name) for name in SAME_CLOCK)
             if alike and other.status == "done" and _key(other, free) == wanted and _last_step(file) is not None:
                 return other
     return None
 
 
-def lend(other: RunFolder, borrower: RunFolder, state: str) -> list[dict[str, Any]]:
+def lend(other: RunFolder, borrower: RunFolder, state: str) -> list[Event]:
     """Copy the state, and the points of the quality-time curve up to it. Gives the ledger's events of that stage."""
     target = state_file(borrower.path, state)
     atomic.write_bytes(target, state_file(other.path, state).read_bytes())
     last = _last_step(target) or 0
     try:
-        points = [point for point in other.curve() if point["step"] <= last]
+        points = [point for point in other.curve() if point.step <= last]
     except BadInput:  # a damaged curve is of no use, the state is
         points = []
-    atomic.write_json_lines(borrower.path / "curve.jsonl", points)
-    events = (other.record.get("ledger") or {}).get("events", [])
-    return [event for event in events if event["data"].get("stage") == state]
+    atomic.write_json_lines(borrower.path / "curve.jsonl", as_json(points))
+    return [event for event in other.record.events if event.data.get("stage") == state]
 
 
 def _last_step(file: Path) -> int | None:
@@ -58,20 +59,7 @@ def _last_step(file: Path) -> int | None:
         return None
 
 
-def _key(run: RunFolder, free: Sequence[str]) -> dict[str, Any]:
-    identity = dict(run.identity)
-    config = _without(identity["config"], free)
-    kept = [name for name in config.get("keep", ()) if not name.startswith(tuple(free))]
-    return identity | {"config": config | {"keep": kept}}
-
-
-def _without(config: dict[str, Any], free: Sequence[str], before: str = "") -> dict[str, Any]:
-    """A configuration as JSON has it, without the fields whose dotted names begin with one of `free`."""
-    out: dict[str, Any] = {}
-    for name, value in config.items():
-        path = f"{before}{name}"
-        if isinstance(value, dict):
-            out[name] = _without(value, free, f"{path}.")
-        elif not path.startswith(tuple(free)):
-            out[name] = value
-    return out
+def _key(run: RunFolder, free: Sequence[str]) -> RunIdentity:
+    config = {name: value for name, value in run.identity.switches.items() if not name.startswith(tuple(free))}
+    kept = [name for name in run.identity.config.get("keep", ()) if not name.startswith(tuple(free))]
+    return replace(run.identity, config={**config, "keep": kept, "outside": run.identity.config.get("outside")})

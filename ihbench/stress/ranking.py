@@ -59,7 +59,7 @@ class Flip:
 
 def flips(before: Mapping[str, float], after: Mapping[str, float], metric: str) -> list[Flip]:
     """The pairs that one ranking has one way round and the other the other way; ties are no flips."""
-    sign = 1 if metric_of(metric).higher_is_better else -1
+    sign = 1 if metric_of(metric.partition("/")[0]).higher_is_better else -1
     found = []
     for a, b in combinations(before, 2):
         if sign * before[a] < sign * before[b]:

@@ -11,7 +11,7 @@ from typing import Any
 
 from ihbench.document.document import Block, Heading, Paragraph, Table, Words, bullets
 from ihbench.metrics import Identity
-from ihbench.metrics.identity import Metric, metric_of
+from ihbench.metrics.identity import Metric
 from ihbench.metrics.statistics import Interval, holm, mean_interval, paired_test
 from ihbench.record.results import RunResult
 from ihbench.reports.general.clock import clock_notes, one_clock
@@ -57,10 +57,10 @@ def _table(ladder: Ladder, protocol: str, cells: Found) -> tuple[list[Block], di
     blocks: list[Block] = [Heading(3, f"{protocol}, {request.method}, {request.protocol.profile} profile")]
     if not done:
         return [*blocks, Paragraph("No run was finished.")], {"protocol": protocol, "rungs": {}, "comparisons": []}
-    headline = done[0].record["about"]["headline"]
+    headline = done[0].headline
     columns = _columns(done, headline)
     quoted = [m for m in PAPER if any(m in rung.paper for rung in ladder.rungs)]
-    titles = [f"{metric_of(i).title} {Identity.parse(i).region} {metric_of(i).arrow}" for i in columns]
+    titles = [f"{i.display.title} {i.region} {i.display.arrow}" for i in columns]
     titles += ["fit s"] + [f"paper's {PAPER[m][0]}" for m in quoted]
     blocks.append(Paragraph(("Data: ", *data_words(done[0]), ".")))
     lines: list[tuple[Words, ...]] = []
@@ -70,7 +70,7 @@ def _table(ladder: Ladder, protocol: str, cells: Found) -> tuple[list[Block], di
         asked = sum(name == rung.name for name, _ in cells)
         scores = {i: _interval(per_scene(having, i)) for i in columns}
         seconds = _interval(_seconds(having)) if one_clock(having) else None
-        cells_shown = [_shown(scores[i], metric_of(i)) for i in columns] + [_whole(seconds)]
+        cells_shown = [_shown(scores[i], i.display) for i in columns] + [_whole(seconds)]
         cells_shown += [f"{rung.paper[m]:.{PAPER[m][1]}f}" if m in rung.paper else "" for m in quoted]
         counted = f"{len(having)}" if len(having) == asked else f"{len(having)} of {asked}"
         scenes = len({run.scene for run in having})
@@ -79,7 +79,7 @@ def _table(ladder: Ladder, protocol: str, cells: Found) -> tuple[list[Block], di
             "switches": {name: _plain(value) for name, value in rung.switches.items()},
             "runs": len(having),
             "asked": asked,
-            "scores": {i: _numbers(interval) for i, interval in scores.items()},
+            "scores": {str(i): _numbers(interval) for i, interval in scores.items()},
             "fit_seconds": _numbers(seconds),
             "left_out": _omissions(having),
             "paper": dict(rung.paper),
@@ -115,38 +115,38 @@ def _timed(runs: Mapping[str, Sequence[RunResult]]) -> dict[str, list[RunResult]
     """Rung -> its runs that have a clock."""
     found = {}
     for rung, having in runs.items():
-        timed = [run for run in having if run.record["about"].get("fit_seconds") is not None]
+        timed = [run for run in having if run.timed]
         if timed:
             found[rung] = timed
     return found
 
 
-def _columns(runs: Sequence[RunResult], headline: str) -> list[str]:
+def _columns(runs: Sequence[RunResult], headline: str) -> list[Identity]:
     """PSNR of the headline region and of what training showed of the surface, then the other metrics' headline."""
-    having = list(dict.fromkeys(i for run in runs for i, mean in run.rows[run.method].items() if not mean.absent))
-    found = [i for i in having if Identity.parse(i).region == headline]
-    first = [i for i in found if Identity.parse(i).metric == "psnr"]
+    having = list(dict.fromkeys(i for run in runs for i, mean in run.own.items() if not mean.absent))
+    found = [i for i in having if i.region == headline]
+    first = [i for i in found if i.metric == "psnr"]
     surface = [
         i for region in REGIONS for i in having
-        if Identity.parse(i).metric == "psnr" and Identity.parse(i).region == region and i not in first
+        if i.metric == "psnr" and i.region == region and i not in first
     ]  # fmt: skip
     return [*first, *surface, *(i for i in found if i not in first)]
 
 
 def _comparisons(
-    wanted: Sequence[Comparison], runs: Mapping[str, Sequence[RunResult]], columns: Sequence[str]
+    wanted: Sequence[Comparison], runs: Mapping[str, Sequence[RunResult]], columns: Sequence[Identity]
 ) -> tuple[list[Block], list[dict[str, Any]]]:
     """A table of differences, p adjusted over a column's comparisons; and the numbers."""
     found: list[dict[str, Any]] = []
     for comparison in wanted:
         before, after = _of_both(runs[comparison.without], runs[comparison.having])
         row: dict[str, Any] = {"what": comparison.what, "without": comparison.without, "with": comparison.having}
-        row["scores"] = {i: _paired(per_scene(after, i), per_scene(before, i)) for i in columns}
+        row["scores"] = {str(i): _paired(per_scene(after, i), per_scene(before, i)) for i in columns}
         alike = one_clock([*before, *after])
         row["fit_seconds"] = _more_seconds(after, before) if alike else None
         found.append(row)
     impossible = []
-    for i in columns:
+    for i in map(str, columns):
         tested = [row["scores"][i] for row in found if row["scores"][i] is not None and row["scores"][i]["n"] > 1]
         for pair, p in zip(tested, holm([pair["p"] for pair in tested]), strict=True):
             pair["p_adjusted"] = p
@@ -155,11 +155,11 @@ def _comparisons(
     found = [row for row in found if any(row["scores"].values())]
     if not found:
         return [], []
-    titles = [f"{metric_of(i).title} {Identity.parse(i).region} {metric_of(i).arrow}" for i in columns]
+    titles = [f"{i.display.title} {i.region} {i.display.arrow}" for i in columns]
     lines: list[tuple[Words, ...]] = []
     for row in found:
         n = max(pair["n"] for pair in row["scores"].values() if pair)
-        cells = [_difference(row["scores"][i], metric_of(i)) for i in columns]
+        cells = [_difference(row["scores"][str(i)], i.display) for i in columns]
         cells.append(_seconds_text(row["fit_seconds"]))
         lines.append((row["what"], str(n), *cells))
     if impossible:
@@ -181,7 +181,7 @@ def _of_both(a: Sequence[RunResult], b: Sequence[RunResult]) -> tuple[list[RunRe
 
 
 def _what(run: RunResult) -> tuple[str, int]:
-    return run.scene, run.identity["seed"]
+    return run.scene, run.seed
 
 
 def _paired(a: Mapping[str, float], b: Mapping[str, float]) -> dict[str, float | int | str | None] | None:
@@ -234,12 +234,13 @@ def _severities(ladder: Ladder, tables: Sequence[Mapping[str, Any]]) -> list[Blo
     if not having:
         return []
     first = next(iter(next(iter(having[0]["rungs"].values()))["scores"]))
-    metric = metric_of(first)
+    identity = Identity.parse(first)
+    metric = identity.display
     lines: list[tuple[Words, ...]] = []
     for rung in ladder.rungs:
         scores = [table["rungs"].get(rung.name, {}).get("scores", {}).get(first) for table in having]
         lines.append((rung.name, *("—" if s is None else metric.text(s["mean"]) for s in scores)))
-    title = f"{metric.title} {Identity.parse(first).region} {metric.arrow} over protocols"
+    title = f"{metric.title} {identity.region} {metric.arrow} over protocols"
     return [Heading(3, title), Table(("rung", *(table["protocol"] for table in having)), tuple(lines))]
 
 
@@ -247,9 +248,8 @@ def _seconds(runs: Sequence[RunResult]) -> dict[str, float]:
     """Scene -> mean fit seconds."""
     found: dict[str, list[float]] = {}
     for run in runs:
-        seconds = run.record["about"].get("fit_seconds")
-        if seconds is not None:
-            found.setdefault(run.scene, []).append(float(seconds))
+        if run.timed:
+            found.setdefault(run.scene, []).append(run.fit_seconds)
     return {scene: math.fsum(values) / len(values) for scene, values in found.items()}
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from ihbench.clock.machine import BUSY
 from ihbench.document.document import Words
@@ -20,7 +19,7 @@ def by_machine(runs: Sequence[RunResult]) -> dict[str, list[RunResult]]:
     Seconds of different machines are never averaged. Runs without a fit (scored predictions) have no seconds and are
     left out.
     """
-    timed = [run for run in runs if run.record["about"].get("fit_seconds") is not None]
+    timed = [run for run in runs if run.timed]
     letters = machine_letters(timed)
     found: dict[str, list[RunResult]] = {}
     for label, group in by_label(timed).items():
@@ -38,16 +37,14 @@ def machine_letters(runs: Sequence[RunResult]) -> dict[str, str]:
 
 def machine_name(run: RunResult) -> str:
     """Processor, cores, threads and device of a run, in words: what must be equal for seconds to be compared."""
-    about = run.record.get("machine") or {}
-    cores, threads = about.get("cores_usable"), about.get("torch_threads")
-    words = [str(about.get("cpu") or "unknown processor"), _counted(cores, "core")]
-    if threads is not None:
-        words.append(_counted(threads, "thread"))
-    device = run.record["about"].get("device", "cpu")
-    if about.get("gpu"):
-        words.append(str(about["gpu"]))
-    elif device != "cpu":
-        words.append(f"{device}, GPU not recorded")
+    machine = run.record.machine
+    words = [machine.cpu or "unknown processor", _counted(machine.cores_usable, "core")]
+    if machine.torch_threads is not None:
+        words.append(_counted(machine.torch_threads, "thread"))
+    if machine.gpu:
+        words.append(machine.gpu)
+    elif run.about.device != "cpu":
+        words.append(f"{run.about.device}, GPU not recorded")
     return ", ".join(words)
 
 
@@ -90,7 +87,7 @@ def clock_notes(rows: Mapping[str, Sequence[RunResult]]) -> list[Words]:
 def _by_scene(runs: Sequence[RunResult]) -> dict[str, list[float]]:
     found: dict[str, list[float]] = {}
     for run in runs:
-        found.setdefault(run.scene, []).append(float(run.record["about"]["fit_seconds"]))
+        found.setdefault(run.scene, []).append(run.fit_seconds)
     return found
 
 
@@ -101,17 +98,17 @@ def _spread(seconds: Sequence[float]) -> float:
 
 
 def _load(run: RunResult) -> float | None:
-    loads = (run.record.get("machine") or {}).get("load_average")
-    return None if not loads else float(loads[0])
+    loads = run.record.machine.load_average
+    return loads[0] if loads else None
 
 
 def _load_per_core(run: RunResult) -> float | None:
     """The larger of the loads at the start, which the run has no part in, and at its end, where a run on all cores
     alone brings about 1 per core. Load is the whole machine's, and so are the cores it is divided by."""
-    about = run.record.get("machine") or {}
-    loads = [float(about[name][0]) for name in ("load_average", "load_average_end") if about.get(name)]
-    return max(loads) / about["cores"] if loads and about.get("cores") else None
+    machine = run.record.machine
+    loads = [load[0] for load in (machine.load_average, machine.load_average_end) if load]
+    return max(loads) / machine.cores if loads and machine.cores else None
 
 
-def _counted(number: Any, what: str) -> str:
+def _counted(number: int | None, what: str) -> str:
     return f"{number if number is not None else '?'} {what}{'' if number == 1 else 's'}"

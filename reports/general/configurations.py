@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ihbench.record.results import RunResult
+from ihbench.record.schema import value_text
 from ihbench.reports.general.clock import by_machine
 
 IMAGE_SIZE = "image size"
@@ -46,19 +47,19 @@ def configurations(runs: Sequence[RunResult], across: bool = False) -> list[Conf
     for label, group in groups.items():
         parts: dict[tuple[str, ...], list[RunResult]] = {}
         for run in group:
-            parts.setdefault((run.identity["profile"], _version(run)) if across else (), []).append(run)
+            parts.setdefault((run.identity.profile, run.identity.protocol) if across else (), []).append(run)
         for part in parts.values():
             first = part[0]
-            changed = dict(text.partition("=")[::2] for text in first.record["about"]["changed"])
-            settings = _flat(first.identity.get("config") or {}) | _in_force(part)
+            changed = {name: value_text(name, value) for name, value in (first.about.changed or {}).items()}
+            settings = first.identity.switches | _in_force(part)
             name = label
             if across:
-                size = _image_size(first)
-                settings |= {PROFILE: first.identity["profile"], IMAGE_SIZE: size}
-                changed[PROFILE] = first.identity["profile"]
-                if "+size=" in first.identity["protocol"]:
+                size = first.about.image_size
+                settings |= {PROFILE: first.identity.profile, IMAGE_SIZE: size}
+                changed[PROFILE] = first.identity.profile
+                if "size" in first.identity.changes:
                     changed[IMAGE_SIZE] = str(size)
-                name += f" [{first.identity['profile']}, {size} px]"
+                name += f" [{first.identity.profile}, {size} px]"
             found.append(Configuration(name, first.method, changed, settings, tuple(part)))
     return found
 
@@ -103,27 +104,8 @@ def _rank(value: Any) -> tuple[float, ...] | None:
     return None
 
 
-def _flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    out: dict[str, Any] = {}
-    for name, value in config.items():
-        if isinstance(value, Mapping):
-            out |= _flat(value, f"{prefix}{name}.")
-        else:
-            out[prefix + name] = value
-    return out
-
-
 def _in_force(runs: Sequence[RunResult]) -> dict[str, Any]:
     """Switches that the plan has changed -> value; None where not all runs have the same."""
     first, *others = [run.planned for run in runs]
     names = dict.fromkeys(name for changed in (first, *others) for name in changed)
     return {n: first.get(n) if all(o.get(n) == first.get(n) for o in others) else None for n in names}
-
-
-def _version(run: RunResult) -> str:
-    return run.identity["protocol"]
-
-
-def _image_size(run: RunResult) -> int:
-    """px; 0 where the record does not say."""
-    return int(run.record["about"].get("protocol", {}).get("image", {}).get("size", 0))

@@ -3,7 +3,7 @@ error against run time, what was painted, intervals and paired tests."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,9 +23,8 @@ from ihbench.document.document import (
 )
 from ihbench.errors import BadInput
 from ihbench.metrics import Identity, Mean, macro_mean
-from ihbench.metrics.identity import metric_of
 from ihbench.record.quality_time import Target
-from ihbench.record.results import RunResult
+from ihbench.record.results import Rows, RunResult, by_group
 from ihbench.record.row_labels import by_label
 from ihbench.reports.general.clock import one_clock
 from ihbench.reports.general.inpainting import inpainting_section
@@ -33,8 +32,6 @@ from ihbench.reports.general.ledger_table import ledger_section
 from ihbench.reports.general.run_time import across_sizes_section, run_time_section
 from ihbench.reports.general.significance import intervals_section
 from ihbench.scoring.calibration import DESCRIPTIONS, ROWS
-
-Rows = dict[str, dict[str, Mean]]  # of one run: row -> identity -> mean
 
 
 def general_report(
@@ -50,11 +47,8 @@ def general_report(
     whose times are asked for; `pictures` (file, caption) come at the end, after the folders that are `left_out`, with
     the reasons.
     """
-    groups: dict[tuple[str, str, str, str], list[RunResult]] = {}
-    for result in results:
-        groups.setdefault(result.group, []).append(result)
     blocks: list[Block] = []
-    for runs in groups.values():
+    for runs in by_group(results).values():
         blocks += _group(runs, presets, targets)
     blocks += across_sizes_section(results)
     if left_out:
@@ -67,13 +61,10 @@ def general_report(
 def score_tables(results: Sequence[RunResult], presets: Sequence[str] = ()) -> list[Table]:
     """What a paper takes from a report: for each protocol, profile and kind of data one table of all metrics and
     regions, and one for each further preset, titled. Raises `BadInput` where no run is done."""
-    groups: dict[tuple[str, str, str, str], list[RunResult]] = {}
-    for result in results:
-        if result.status == "done":
-            groups.setdefault(result.group, []).append(result)
+    groups = by_group(result for result in results if result.status == "done")
     found: list[Table] = []
     for (protocol, digest, profile, data), runs in groups.items():
-        headline = runs[0].record["about"]["headline"]
+        headline = runs[0].headline
         title = f"{protocol} ({digest}), {profile} profile, {data}"
         columns = [i for i in dict.fromkeys(i for r in runs for i in r.rows[r.method]) if _has_a_number(runs, i)]
         if columns:
@@ -91,7 +82,7 @@ def score_tables(results: Sequence[RunResult], presets: Sequence[str] = ()) -> l
     return found
 
 
-def _preset_columns(rows: Sequence[Rows]) -> list[str]:
+def _preset_columns(rows: Sequence[Rows]) -> list[Identity]:
     """Identities with a number in any row."""
     every = dict.fromkeys(i for found in rows for means in found.values() for i in means)
     return [i for i in every if any(i in means and not means[i].absent for found in rows for means in found.values())]
@@ -104,21 +95,21 @@ def _group(runs: list[RunResult], presets: Sequence[str], targets: Sequence[Targ
         Paragraph(("Data: ", *data_words(runs[0]), ". Protocol digest ", code(digest), ".")),
     ]
     blocks += [
-        Paragraph(f"Not done: {run.method} on {run.scene}: {run.status} ({run.record['reason']}).")
+        Paragraph(f"Not done: {run.method} on {run.scene}: {run.status} ({run.reason}).")
         for run in runs
         if run.status != "done"
     ]
     done = [run for run in runs if run.status == "done"]
     if not done:
         return blocks
-    headline = done[0].record["about"]["headline"]
-    identities = list(dict.fromkeys(i for run in done for i in run.rows[run.method]))
-    for metric in dict.fromkeys(Identity.parse(i).metric for i in identities):
-        columns = [i for i in identities if Identity.parse(i).metric == metric and _has_a_number(done, i)]
+    headline = done[0].headline
+    identities = list(dict.fromkeys(i for run in done for i in run.own))
+    for metric in dict.fromkeys(i.metric for i in identities):
+        columns = [i for i in identities if i.metric == metric and _has_a_number(done, i)]
         if columns:
-            shown = metric_of(columns[0])
+            shown = columns[0].display
             blocks.append(Heading(3, f"{shown.title} {shown.arrow}{f' ({shown.unit})' if shown.unit else ''}"))
-            first = metric == Identity.parse(identities[0]).metric
+            first = metric == identities[0].metric
             blocks.append(_table(done, [run.rows for run in done], columns, headline, with_costs=first))
     blocks.append(
         Paragraph(
@@ -139,10 +130,8 @@ def _group(runs: list[RunResult], presets: Sequence[str], targets: Sequence[Targ
 
 def data_words(run: RunResult) -> tuple[str | Span, ...]:
     """What a run was made on."""
-    about = run.record["about"]
-    if about["standin"]:
-        return strong(about["standin"]), ": made by the bench, not real data"
-    return (f"real data ({about['variant']})",)
+    standin = run.about.standin
+    return (strong(standin), run.data.removeprefix(standin)) if standin else (run.data,)
 
 
 def _preset(name: str, runs: list[RunResult], headline: str) -> list[Block]:
@@ -157,7 +146,7 @@ def _preset(name: str, runs: list[RunResult], headline: str) -> list[Block]:
     if columns:
         blocks.append(_table(having, rows, columns, headline, with_metric=True))
     absent = {
-        f"absent: {metric_of(i).title} of {name}: {found[run.method][i].reason}"
+        f"absent: {i.display.title} of {name}: {found[run.method][i].reason}"
         for run, found in zip(having, rows, strict=True)
         for i in identities
         if i in found[run.method] and found[run.method][i].absent
@@ -165,14 +154,14 @@ def _preset(name: str, runs: list[RunResult], headline: str) -> list[Block]:
     return [*blocks, *_definitions(identities), Bullets(("scored from the runs' 8-bit renders", *sorted(absent)))]
 
 
-def _has_a_number(runs: list[RunResult], identity: str) -> bool:
+def _has_a_number(runs: list[RunResult], identity: Identity) -> bool:
     """Whether any run has a method's number of this identity; `truth` and its like have them where methods do."""
-    return any(identity in run.rows[run.method] and not run.rows[run.method][identity].absent for run in runs)
+    return any(identity in run.own and not run.own[identity].absent for run in runs)
 
 
-def _definitions(identities: Sequence[str]) -> list[Block]:
+def _definitions(identities: Sequence[Identity]) -> list[Block]:
     """The identity strings in the tables, with the region left open."""
-    names = dict.fromkeys(i.replace(f"/{Identity.parse(i).region}/", "/REGION/") for i in identities)
+    names = dict.fromkeys(str(replace(i, region="REGION")) for i in identities)
     words: list[Words] = []
     for name in names:
         words += [" ", code(name)] if words else [code(name)]
@@ -182,16 +171,16 @@ def _definitions(identities: Sequence[str]) -> list[Block]:
 def _table(
     runs: list[RunResult],
     rows_of: Sequence[Rows],  # of each run
-    columns: Sequence[str],
+    columns: Sequence[Identity],
     headline: str,
     *,
     with_costs: bool = False,
     with_metric: bool = False,
 ) -> Table:
-    parsed = [Identity.parse(i) for i in columns]
+    parsed = [i for i in columns]
     names = [i.region for i in parsed]
     if with_metric:
-        names = [f"{metric_of(str(i)).title}{metric_of(str(i)).arrow} {i.region}" for i in parsed]
+        names = [f"{i.display.title}{i.display.arrow} {i.region}" for i in parsed]
     names = [  # regions of several presets in one table
         f"{name} ({i.variant})" if names.count(name) > 1 else name for i, name in zip(parsed, names, strict=True)
     ]
@@ -205,7 +194,7 @@ def _table(
         cells = [
             label,
             str(len({r.scene for r in group})),
-            ", ".join(sorted({str(r.identity["seed"]) for r in group})),
+            ", ".join(sorted({str(r.seed) for r in group})),
         ]
         cells += [_cell([(runs[k].scene, rows_of[k][runs[k].method]) for k in chosen], i) for i in columns]
         if with_costs:
@@ -229,7 +218,7 @@ def _table(
     return Table(tuple(head), tuple(lines), left=3)
 
 
-def _cell(per_run: list[tuple[str, dict[str, Mean]]], identity: str) -> str:
+def _cell(per_run: list[tuple[str, Mapping[Identity, Mean]]], identity: Identity) -> str:
     """Mean over seeds within a scene, then over scenes."""
     by_scene: dict[str, dict[str, Mean]] = {}
     for k, (scene, means) in enumerate(per_run):
@@ -237,17 +226,16 @@ def _cell(per_run: list[tuple[str, dict[str, Mean]]], identity: str) -> str:
             by_scene.setdefault(scene, {})[str(k)] = means[identity]
     if not by_scene:
         return "—"
-    return metric_of(identity).text(macro_mean({scene: macro_mean(runs) for scene, runs in by_scene.items()}).value)
+    return identity.display.text(macro_mean({scene: macro_mean(runs) for scene, runs in by_scene.items()}).value)
 
 
 def _mean_of(runs: list[RunResult], key: str) -> str:
-    values = [run.record["about"][key] for run in runs]
-    known = [value for value in values if value is not None]
+    known = [value for run in runs if (value := getattr(run.about, key)) is not None]
     return f"{sum(known) / len(known):.0f}" if known else "—"
 
 
 def _largest(runs: list[RunResult], key: str) -> str:
-    return f"{max(run.record['about'][key] for run in runs):.0f}"
+    return f"{max(getattr(run.about, key) for run in runs):.0f}"
 
 
 def _scenes(runs: list[RunResult]) -> str:
@@ -262,20 +250,18 @@ def _remarks(runs: list[RunResult]) -> list[str]:
     omitted: dict[tuple[str, str], list[str]] = {}  # row and what was left out -> scenes
     labels = {id(run): label for label, group in by_label(runs).items() for run in group}
     for run in runs:
-        for identity, mean in run.rows[run.method].items():
-            metric, region = metric_of(identity).title, Identity.parse(identity).region
+        for identity, mean in run.own.items():
+            metric, region = identity.display.title, identity.region
             if mean.absent:
                 absent.setdefault((metric, mean.reason), []).append(region)
             elif mean.note:
                 partly.setdefault((run.scene, region, mean.note), []).append(metric)
-        for o in run.record["about"]["left_out"]:
-            what = f"{o['field']} → {o['value']}: {o['reason']}"
+        for o in run.about.left_out or ():
+            what = f"{o.field} → {o.value}: {o.reason}"
             omitted.setdefault((labels[id(run)], what), []).append(run.scene)
-        notes += [
-            f"{run.method} on {run.scene}: {note}"
-            for kind in ("notes", "doubts")
-            for note in run.record["about"].get("predictions", {}).get(kind, ())
-        ]
+        files = run.about.predictions
+        told = () if files is None else (*files.notes, *files.doubts)
+        notes += [f"{run.method} on {run.scene}: {note}" for note in told]
         notes += [f"{run.method} on {run.scene}: not shown: {damage}" for damage in run.damage]
     for (label, what), scenes in omitted.items():
         notes.append(f"left out, {label} on {', '.join(dict.fromkeys(scenes))}: {what}")

@@ -17,8 +17,8 @@ from ihbench.metrics.identity import METRICS
 from ihbench.metrics.statistics import Interval, interval_ends
 from ihbench.record import outputs
 from ihbench.record.quality_time import QualityCurve, error_of, pareto_set
-from ihbench.record.results import RunResult
-from ihbench.record.store import plain_name
+from ihbench.record.results import RunResult, by_group
+from ihbench.record.schema import plain_name
 from ihbench.reports.general.configurations import Configuration, configurations, short_value, sweeps
 from ihbench.reports.general.run_time import (
     LEVEL,
@@ -52,21 +52,18 @@ def draw(results: Sequence[RunResult], folder: Path) -> list[tuple[Path, str]]:
     Runs without a fit time or without numbers have no figure; none of them is no error.
     """
     drawn: list[tuple[Path, str]] = []
-    groups: dict[tuple[str, ...], list[RunResult]] = {}
-    for run in results:
-        if run.status == "done":
-            groups.setdefault(run.group, []).append(run)
+    groups = by_group(run for run in results if run.status == "done")
     names: set[str] = set()
     for (protocol, digest, profile, data), runs in groups.items():
         name = _new(f"{plain_name(protocol)}_{plain_name(profile)}", digest, names)
         configs = configurations(runs)
-        headline = runs[0].record["about"]["headline"]
+        headline = runs[0].headline
         title = f"{protocol}, {profile} profile"
         drawn += _work_precision(configs, headline, folder / f"work-precision_{name}", title, data)
         drawn += _quality_time(configs, headline, folder / f"quality-time_{name}", title, data)
     for (protocol, data), runs in same_protocol(results).items():
         name = _new(f"{plain_name(protocol)}_profiles-and-sizes", "", names)
-        headline = runs[0].record["about"]["headline"]
+        headline = runs[0].headline
         about = f"{data}; test images differ in size: compare errors with care"
         configs = configurations(runs, across=True)
         title = f"{protocol}: profiles and image sizes"
@@ -90,9 +87,9 @@ def _work_precision(
     configs: Sequence[Configuration], headline: str, path: Path, title: str, about: str
 ) -> list[tuple[Path, str]]:
     configs, scenes = comparable(configs)
-    found: dict[str, list[WorkPoint]] = {}
-    for i in dict.fromkeys(i for c in configs for run in c.runs for i in run.rows[run.method]):
-        parsed = Identity.parse(i)
+    found: dict[Identity, list[WorkPoint]] = {}
+    for i in dict.fromkeys(i for c in configs for run in c.runs for i in run.own):
+        parsed = i
         if parsed.region != headline or parsed.metric not in METRICS or len(found) == DRAWN:
             continue
         points = [p for p in work_points(configs, i, scenes) if p.seconds.value > 0 and p.error.value > 0]
@@ -189,7 +186,7 @@ def _shown(intervals: Sequence[Interval]) -> list[float]:
     return [*values, *(min(max(end, low), high) for end in ends)]
 
 
-def _csv_row(p: WorkPoint, identity: str, on_front: bool, scenes: Sequence[str]) -> dict[str, Any]:
+def _csv_row(p: WorkPoint, identity: Identity, on_front: bool, scenes: Sequence[str]) -> dict[str, Any]:
     c = p.configuration
     runs = [run for run in c.runs if run.scene in scenes]
     return {
@@ -202,7 +199,7 @@ def _csv_row(p: WorkPoint, identity: str, on_front: bool, scenes: Sequence[str])
         "fit_seconds_low": p.seconds.low,
         "fit_seconds_high": p.seconds.high,
         "total_seconds": seconds_interval(runs, "total_seconds").value,
-        "identity": identity,
+        "identity": str(identity),
         "value": p.value.value,
         "value_low": p.value.low,
         "value_high": p.value.high,
@@ -220,14 +217,14 @@ def _quality_time(
     configs: Sequence[Configuration], headline: str, path: Path, title: str, about: str
 ) -> list[tuple[Path, str]]:
     known = curve_identities(configs)
-    metrics = [m for m in ("psnr", "flip") if any(Identity.parse(i).metric == m for i in known)]
+    metrics = [m for m in ("psnr", "flip") if any(i.metric == m for i in known)]
     regions = [headline, *(r for r in PARTITION if r != headline)]
     panels = {
         (metric, region): identity
         for metric in metrics
         for region in regions
         for identity in known
-        if (Identity.parse(identity).metric, Identity.parse(identity).region) == (metric, region)
+        if (identity.metric, identity.region) == (metric, region)
     }
     metrics = [m for m in metrics if any(metric == m for metric, _ in panels)]
     regions = [r for r in regions if any(region == r for _, region in panels)]
@@ -260,17 +257,17 @@ def _quality_time(
 
 
 def _curve_panel(
-    panel: Axes, configs: Sequence[Configuration], identity: str, handles: dict[str, Any]
+    panel: Axes, configs: Sequence[Configuration], identity: Identity, handles: dict[str, Any]
 ) -> list[dict[str, Any]]:
     """Draw every configuration's checkpoints and mean curve; gives what was drawn as rows."""
-    metric = Identity.parse(identity).metric
+    metric = identity.metric
     rows: list[dict[str, Any]] = []
     for k, c in enumerate(configs):
         colour, mark = diagram.COLOURS[k % len(diagram.COLOURS)], diagram.MARKS[k % len(diagram.MARKS)]
         found = curves(c, identity)
-        by_run = {(run.scene, run.identity["seed"]): [run] for run in c.runs}
+        by_run = {(run.scene, run.seed): [run] for run in c.runs}
         points = [
-            {"kind": "checkpoint", "configuration": c.label, "scene": scene, "seed": seed, "identity": identity,
+            {"kind": "checkpoint", "configuration": c.label, "scene": scene, "seed": seed, "identity": str(identity),
              "seconds": float(t), "value": float(v), "test_views": standing(by_run[scene, seed]),
              "error": error_of(metric, float(v))}
             for (scene, seed), curve in found.items()
@@ -293,7 +290,7 @@ def _curve_panel(
             )  # fmt: skip
             rows += points
         rows += [
-            {"kind": "mean", "configuration": c.label, "identity": identity, "seconds": t, "value": value,
+            {"kind": "mean", "configuration": c.label, "identity": str(identity), "seconds": t, "value": value,
              "test_views": standing(c.runs), "error": error_of(metric, value), "value_low": low_end,
              "value_high": high_end}
             for t, value, low_end, high_end in mean
@@ -322,12 +319,12 @@ def _mean_curve(found: dict[tuple[str, int], QualityCurve]) -> list[tuple[float,
 # ------------------------------------------------------------------------------------------------------------- shared
 
 
-def _name_axes(panel: Axes, identity: str, below: str, where: str = "") -> None:
+def _name_axes(panel: Axes, identity: Identity, below: str, where: str = "") -> None:
     """Name the axes; `where` says on which views. A PSNR's error gets its decibels on the right."""
-    metric = Identity.parse(identity).metric
+    metric = identity.metric
     panel.set_xlabel(below)
     panel.set_ylabel(f"{AXES.get(metric, metric)}  (less is better){where}")
-    panel.set_title(Identity.parse(identity).region)
+    panel.set_title(identity.region)
     if metric == "psnr":
         beside = panel.twinx()
         low, high = panel.get_ylim()

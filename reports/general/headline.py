@@ -9,8 +9,7 @@ from rich.cells import cell_len, set_cell_size
 
 from ihbench.errors import visible
 from ihbench.metrics import Identity, macro_mean
-from ihbench.metrics.identity import metric_of
-from ihbench.record.results import TRACEBACK, RunResult
+from ihbench.record.results import TRACEBACK, RunResult, by_group
 from ihbench.record.row_labels import by_label
 from ihbench.reports.general.clock import one_clock
 from ihbench.reports.general.significance import scene_means
@@ -27,15 +26,12 @@ def write(results: Sequence[RunResult], left_out: Sequence[str] = (), width: int
     """Lines of at most `width` columns, but for paths, which are whole: of every protocol, profile and kind of data
     the headline region's metrics by row, methods before calibration rows; runs that are not done; contact sheets."""
     width = max(NARROWEST, min(width, WIDTH))
-    groups: dict[tuple[str, ...], list[RunResult]] = {}
-    for result in results:
-        groups.setdefault(result.group, []).append(result)
     lines: list[str] = []
-    for runs in groups.values():
+    for runs in by_group(results).values():
         lines += [*_group(runs, width), ""]
     unfinished = [run for run in results if run.status != "done"]
     for run in unfinished[:SHOWN]:
-        reason = f" ({run.record['reason']})" if run.record["reason"] else ""
+        reason = f" ({run.reason})" if run.reason else ""
         lines += _wrapped(f"not done: {run.method} on {run.scene}: {run.status}{reason}", width)
         traceback = run.folder / TRACEBACK
         lines.append(f"see {visible(str(traceback if traceback.is_file() else run.folder))}")
@@ -59,13 +55,13 @@ def _group(runs: Sequence[RunResult], width: int) -> list[str]:
     done = [run for run in runs if run.status == "done"]
     if not done:
         return title
-    headline = done[0].record["about"]["headline"]
-    found = dict.fromkeys(i for run in done for i in run.rows[run.method])
-    in_headline = [i for i in found if Identity.parse(i).region == headline]
-    own = [run.rows[run.method] for run in done]
+    headline = done[0].headline
+    found = dict.fromkeys(i for run in done for i in run.own)
+    in_headline = [i for i in found if i.region == headline]
+    own = [run.own for run in done]
     present = [i for i in in_headline if any(i in means and not means[i].absent for means in own)]
     rows = _rows(done, present)
-    heads = [f"{metric_of(i).title} {metric_of(i).arrow}" for i in present] + ["fit s"]
+    heads = [f"{i.display.title} {i.display.arrow}" for i in present] + ["fit s"]
     table = [(visible(name), cells) for name, cells in [(f"region {headline}", heads), *rows]]
     sizes = [max(cell_len(cells[k]) for _, cells in table) for k in range(len(heads))]
     kept = list(range(len(heads)))
@@ -77,7 +73,7 @@ def _group(runs: Sequence[RunResult], width: int) -> list[str]:
         (_cut(name, room) + "".join(" " * (GAP + sizes[k] - cell_len(cells[k])) + cells[k] for k in kept)).rstrip()
         for name, cells in table
     ]
-    absent = [metric_of(i).title for i in in_headline if i not in present]
+    absent = [i.display.title for i in in_headline if i not in present]
     absent += [heads[k] for k in range(len(heads)) if k not in kept]
     scenes = sorted({run.scene for run in done})
     told = f"mean over test views of {', '.join(scenes) if len(scenes) <= SHOWN else f'{len(scenes)} scenes'}"
@@ -89,13 +85,13 @@ def _group(runs: Sequence[RunResult], width: int) -> list[str]:
     return [*title, "", lines[0], "-" * max(map(cell_len, lines)), *lines[1:], "", *_wrapped(told, width), *why]
 
 
-def _rows(done: Sequence[RunResult], identities: Sequence[str]) -> list[tuple[str, list[str]]]:
+def _rows(done: Sequence[RunResult], identities: Sequence[Identity]) -> list[tuple[str, list[str]]]:
     """Name and cells of each row: the methods', with their further groups of test views, then the calibration's."""
     rows = []
     for label, group in by_label(done).items():
         method = group[0].method
         further = dict.fromkeys(row for run in group for row in run.rows if row.startswith(f"{method} ["))
-        seconds = [run.record["about"]["fit_seconds"] for run in group]
+        seconds = [run.about.fit_seconds for run in group]
         known = [value for value in seconds if value is not None]
         fit = f"{sum(known) / len(known):.0f}" if known and one_clock(group) else "—"
         rows.append((label, [*_cells(group, identities, method), fit]))
@@ -104,10 +100,10 @@ def _rows(done: Sequence[RunResult], identities: Sequence[str]) -> list[tuple[st
     return [*rows, *((row, [*_cells(done, identities, row), ""]) for row in bounds)]
 
 
-def _cells(runs: Sequence[RunResult], identities: Sequence[str], row: str) -> list[str]:
+def _cells(runs: Sequence[RunResult], identities: Sequence[Identity], row: str) -> list[str]:
     means = [scene_means(runs, identity, row) for identity in identities]
     return [
-        metric_of(identity).text(macro_mean(found).value) if found else "—"
+        identity.display.text(macro_mean(found).value) if found else "—"
         for identity, found in zip(identities, means, strict=True)
     ]
 

@@ -3,30 +3,34 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, TypedDict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 from ihbench.clock.events import Inpainted
 from ihbench.document.document import Block, Heading, Paragraph, Table, Words, bullets
+from ihbench.files.shape import Within, fault, from_json
 from ihbench.record.results import RunResult
-from ihbench.record.shape import Within, fault
 
 Measured = Annotated[float, Within(nan=True, infinite=True)] | None
 
 
-class Drift(TypedDict):
+@dataclass(frozen=True)
+class Drift:
     delta_e: Measured
     delta_e_floor: Measured
     texture: Measured
     texture_floor: Measured
 
 
-class Flicker(TypedDict):
+@dataclass(frozen=True)
+class Flicker:
     deviation: Measured
     deviation_floor: Measured
 
 
-class Painted(TypedDict):
+@dataclass(frozen=True)
+class Painted:
     """What the event of a run that painted says."""
 
     views: Measured
@@ -39,7 +43,9 @@ class Painted(TypedDict):
 def inpainting_section(labelled: Mapping[str, Sequence[RunResult]]) -> list[Block]:
     """A table over the runs that painted something; nothing without any."""
     painted = {label: [e for run in runs for e in _painted(run)] for label, runs in labelled.items()}
-    found = {label: [e for e in events if not fault(e, Painted)] for label, events in painted.items()}
+    found: dict[str, list[Painted]] = {
+        label: [from_json(e, Painted) for e in events if not fault(e, Painted)] for label, events in painted.items()
+    }
     notes: list[Words] = [
         f"not in the means of {label}: {len(events) - len(found[label])} whose record of it is damaged"
         for label, events in painted.items()
@@ -50,15 +56,14 @@ def inpainting_section(labelled: Mapping[str, Sequence[RunResult]]) -> list[Bloc
         return [Heading(3, "Inpainting"), *bullets(notes)] if notes else []
     rows: list[tuple[Words, ...]] = []
     for label, events in found.items():
-        drifts = [event["identity_drift"] for event in events]
-        flickers = [event["flicker"] for event in events]
+        drifts, flickers = [event.identity_drift for event in events], [event.flicker for event in events]
         cells = [
             str(len(events)),
-            f"{_mean(events, 'views'):.0f} of {_mean(events, 'of'):.0f}",
-            f"{_mean(events, 'pixels'):.0f}",
-            _pair(drifts, "delta_e", "delta_e_floor", 1),
-            _pair(drifts, "texture", "texture_floor", 1),
-            _pair(flickers, "deviation", "deviation_floor", 3),
+            f"{_mean(e.views for e in events):.0f} of {_mean(e.of for e in events):.0f}",
+            f"{_mean(e.pixels for e in events):.0f}",
+            _pair((d.delta_e for d in drifts), (d.delta_e_floor for d in drifts), 1),
+            _pair((d.texture for d in drifts), (d.texture_floor for d in drifts), 1),
+            _pair((f.deviation for f in flickers), (f.deviation_floor for f in flickers), 3),
         ]
         rows.append((label, *cells))
     head = ("method", "runs", "views painted", "pixels", "drift ΔE (floor)", "texture (floor)", "flicker (floor)")
@@ -73,20 +78,20 @@ def inpainting_section(labelled: Mapping[str, Sequence[RunResult]]) -> list[Bloc
     ]
 
 
-def _painted(run: RunResult) -> list[dict[str, Any]]:
-    events = (run.record.get("ledger") or {}).get("events", [])
-    painted = [event["data"] for event in events if event["kind"] == Inpainted.kind]
-    return painted[-1:]  # the last, if a run was resumed
+def _painted(run: RunResult) -> list[Mapping[str, Any]]:
+    return [event.data for event in run.record.events if event.kind == Inpainted.kind][
+        -1:
+    ]  # the last, if a run was resumed
 
 
-def _mean(rows: Sequence[Mapping[str, Any]], name: str) -> float:
+def _mean(values: Iterable[Measured]) -> float:
     """The mean of the finite values; NaN without any."""
-    values = [float(row[name]) for row in rows if row[name] is not None and math.isfinite(float(row[name]))]
-    return math.fsum(values) / len(values) if values else math.nan
+    known = [value for value in values if value is not None and math.isfinite(value)]
+    return math.fsum(known) / len(known) if known else math.nan
 
 
-def _pair(rows: Sequence[Mapping[str, Any]], name: str, floor: str, digits: int) -> str:
-    value, below = _mean(rows, name), _mean(rows, floor)
+def _pair(values: Iterable[Measured], floors: Iterable[Measured], digits: int) -> str:
+    value, below = _mean(values), _mean(floors)
     if math.isnan(value):
         return "absent"
     return f"{value:.{digits}f} ({below:.{digits}f})" if math.isfinite(below) else f"{value:.{digits}f}"

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 
-from ihbench.clock.ledger import in_order
+from ihbench.clock.ledger import REDONE, in_order
 from ihbench.document.document import Block, Heading, Paragraph, Table, Words, bullets, emphasis, strong
 from ihbench.record.results import RunResult
+from ihbench.record.schema import LedgerState, RunRecord
 from ihbench.reports.general.clock import by_machine
 
 TOLERANCE = 0.02  # of the wall clock, that stages may leave unnamed
@@ -63,11 +64,11 @@ class Account:
 
 def account(run: RunResult) -> Account | None:
     """The books of a run; None when it left none."""
-    ledger = run.record.get("ledger")
-    if not ledger or "seconds" not in ledger:
+    ledger = run.record.ledger
+    if ledger is None:
         return None
-    stages = {path: float(ledger["stages"][path]["seconds"]) for path in in_order(ledger["stages"])}
-    return Account(stages, float(ledger["seconds"]), _stamped(run))
+    stages = {path: ledger.stages[path].seconds for path in in_order(ledger.stages)}
+    return Account(stages, ledger.seconds, _stamped(run.record, ledger, scored_again=bool(run.presets)))
 
 
 def ledger_section(runs: Sequence[RunResult]) -> list[Block]:
@@ -128,7 +129,7 @@ def _check(pairs: Sequence[tuple[RunResult, Account]]) -> list[Block]:
         )
     notes: list[Words] = []
     for run, a in pairs:
-        who = f"{run.method} on {run.scene}, seed {run.identity['seed']}"
+        who = f"{run.method} on {run.scene}, seed {run.seed}"
         if not a.adds_up:
             what = (
                 f"{', '.join(a.overfull)} is less than its parts" if a.overfull else f"{a.unnamed_share:.1%} unnamed"
@@ -139,16 +140,11 @@ def _check(pairs: Sequence[tuple[RunResult, Account]]) -> list[Block]:
     return [Paragraph(told), *bullets(notes)]
 
 
-def _stamped(run: RunResult) -> float:
+def _stamped(record: RunRecord, ledger: LedgerState, scored_again: bool) -> float:
     """Seconds from the record's creation to its last writing, where one process did the whole run in between."""
-    ledger, record = run.record["ledger"], run.record
-    again = any(event["kind"] in SEVERAL_CLOCKS for event in ledger.get("events", ()))
-    again |= any(
-        stage.get("entered", 1) > 1 for path, stage in ledger["stages"].items() if path in ("occlude", "load")
-    )
-    if again or "redone" in ledger["stages"] or not {"created", "updated"} <= record.keys():
+    again = scored_again or REDONE in ledger.stages or any(event.kind in SEVERAL_CLOCKS for event in ledger.events)
+    again |= any(ledger.stages[path].entered > 1 for path in ("occlude", "load") if path in ledger.stages)
+    if again or record.outcome.updated is None:
         return math.nan
-    if run.presets:  # scored again later
-        return math.nan
-    between = datetime.fromisoformat(record["updated"]) - datetime.fromisoformat(record["created"])
-    return between.total_seconds() + float(ledger["stages"].get(BEFORE, {}).get("seconds", 0.0))
+    between = datetime.fromisoformat(record.outcome.updated) - datetime.fromisoformat(record.outcome.created)
+    return between.total_seconds() + (ledger.stages[BEFORE].seconds if BEFORE in ledger.stages else 0.0)

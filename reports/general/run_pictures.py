@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ihbench.clock.ledger import ARTIFACTS
-from ihbench.record.results import RunResult
+from ihbench.record.results import RunResult, by_group
 from ihbench.record.row_labels import by_label
 
 PICTURES = {"contact_sheet.png": "test views", **ARTIFACTS}
@@ -20,10 +20,7 @@ def run_pictures(results: Sequence[RunResult]) -> list[tuple[Path, str]]:
 
     What is missing, no PNG or no plain file is passed over: a report does not depend on it.
     """
-    groups: dict[tuple[str, ...], list[RunResult]] = {}
-    for result in results:
-        if result.status == "done":
-            groups.setdefault(result.group, []).append(result)
+    groups = by_group(result for result in results if result.status == "done")
     pictures: list[tuple[Path, str]] = []
     size = 0
     for (protocol, _, profile, _), runs in groups.items():
@@ -35,7 +32,7 @@ def run_pictures(results: Sequence[RunResult]) -> list[tuple[Path, str]]:
                     bytes_ = _size(file)
                     if bytes_ and size + bytes_ <= LARGEST_PAGE:
                         size += bytes_
-                        where = f"{run.scene}, seed {run.identity['seed']}"
+                        where = f"{run.scene}, seed {run.seed}"
                         pictures.append((file, f"{label} on {where}: {what} ({protocol}, {profile})"))
     return pictures
 

@@ -13,7 +13,6 @@ import numpy as np
 
 from ihbench.document.document import Block, Heading, Paragraph, Table, Words, bullets
 from ihbench.metrics import Identity
-from ihbench.metrics.identity import metric_of
 from ihbench.metrics.statistics import Interval, mean_interval, median_interval
 from ihbench.record.quality_time import (
     NEVER,
@@ -68,7 +67,7 @@ def comparable(configs: Sequence[Configuration]) -> tuple[list[Configuration], l
     return [c for c, having in zip(configs, own, strict=True) if best and best <= having], sorted(best)
 
 
-def work_points(configs: Sequence[Configuration], identity: str, scenes: Sequence[str]) -> list[WorkPoint]:
+def work_points(configs: Sequence[Configuration], identity: Identity, scenes: Sequence[str]) -> list[WorkPoint]:
     """Seconds and error of every configuration over these scenes; those without a finite number are left out."""
     found = []
     for c in configs:
@@ -77,7 +76,7 @@ def work_points(configs: Sequence[Configuration], identity: str, scenes: Sequenc
         if not values:
             continue
         value = mean_interval(values, LEVEL)
-        metric = Identity.parse(identity).metric
+        metric = identity.metric
         ends = sorted(error_of(metric, end) for end in (value.low, value.high))
         error = Interval(error_of(metric, value.value), ends[0], ends[1], value.level, value.n, value.method)
         found.append(WorkPoint(c, seconds_interval(runs), value, error))
@@ -88,26 +87,25 @@ def seconds_interval(runs: Sequence[RunResult], key: str = "fit_seconds") -> Int
     """Mean seconds with its interval: over scenes (each the mean of its repeats), or over repeats of one scene."""
     by_scene: dict[str, list[float]] = {}
     for run in runs:
-        by_scene.setdefault(run.scene, []).append(float(run.record["about"][key]))
+        by_scene.setdefault(run.scene, []).append(float(getattr(run.about, key)))
     if len(by_scene) > 1:
         return mean_interval(by_scene, LEVEL)
     return mean_interval({str(k): seconds for k, seconds in enumerate(next(iter(by_scene.values())))}, LEVEL)
 
 
-def curves(configuration: Configuration, identity: str) -> dict[tuple[str, int], QualityCurve]:
+def curves(configuration: Configuration, identity: Identity) -> dict[tuple[str, int], QualityCurve]:
     """(scene, seed) -> the run's curve; runs without such a curve are left out."""
-    higher = metric_of(identity).higher_is_better
     found = {}
     for run in configuration.runs:
-        curve = curve_of(run.curve, identity, higher)
+        curve = curve_of(run.curve, identity)
         if len(curve.values):
-            found[run.scene, run.identity["seed"]] = curve
+            found[run.scene, run.seed] = curve
     return found
 
 
-def curve_identities(configs: Sequence[Configuration]) -> list[str]:
+def curve_identities(configs: Sequence[Configuration]) -> list[Identity]:
     """Identities that any run has a curve of, in the order of the file."""
-    return list(dict.fromkeys(i for c in configs for run in c.runs for p in run.curve for i in p["scores"]))
+    return list(dict.fromkeys(i for c in configs for run in c.runs for p in run.curve for i in p.scores))
 
 
 def times_to(target: float, found: Mapping[tuple[str, int], QualityCurve], scenes: Sequence[str]) -> dict[str, float]:
@@ -123,21 +121,20 @@ def standing(runs: Iterable[RunResult]) -> str:
     """On how many of how many test views the curves of these runs stand: "6 of 55", "all 4"."""
     found: set[tuple[int, int]] = set()
     for run in runs:
-        tested = max((mean.total for mean in run.rows.get(run.method, {}).values()), default=0)
+        tested = max((mean.total for mean in run.own.values()), default=0)
         for point in run.curve:
-            views, of = (n if isinstance(n, int) else 0 for n in (point.get("views"), point.get("of")))
-            found.add((views, of or tested))
+            found.add((point.views, point.of or tested))
     texts = [
         f"all {of}" if 0 < views == of else f"{views or 'some'} of {of or 'more'}" for views, of in sorted(found)
     ]
     return " or ".join(texts)
 
 
-def in_table(configuration: Configuration, identity: str, scenes: Sequence[str]) -> dict[str, float]:
+def in_table(configuration: Configuration, identity: Identity, scenes: Sequence[str]) -> dict[str, float]:
     """Scene -> what the table has of these runs, over all test views: the mean over seeds, NaN where absent."""
     by_scene: dict[str, list[float]] = {}
     for run in configuration.runs:
-        mean = run.rows.get(run.method, {}).get(identity)
+        mean = run.own.get(identity)
         if run.scene in scenes:
             by_scene.setdefault(run.scene, []).append(math.nan if mean is None else mean.value)
     return {scene: sum(values) / len(values) for scene, values in by_scene.items()}
@@ -147,7 +144,7 @@ def in_table(configuration: Configuration, identity: str, scenes: Sequence[str])
 
 
 def run_time_section(
-    runs: Sequence[RunResult], identities: Sequence[str], headline: str, targets: Sequence[Target] = ()
+    runs: Sequence[RunResult], identities: Sequence[Identity], headline: str, targets: Sequence[Target] = ()
 ) -> list[Block]:
     """Seconds against error of the rows of one group; nothing where no run has a fit time."""
     configs = configurations(runs)
@@ -163,8 +160,8 @@ def across_sizes_section(results: Sequence[RunResult]) -> list[Block]:
     """Where one protocol was run under several profiles or image sizes: their rows side by side, with a warning."""
     blocks: list[Block] = []
     for (name, _), runs in same_protocol(results).items():
-        headline = runs[0].record["about"]["headline"]
-        identities = list(dict.fromkeys(i for run in runs for i in run.rows[run.method]))
+        headline = runs[0].headline
+        identities = list(dict.fromkeys(i for run in runs for i in run.own))
         configs = configurations(runs, across=True)
         if len(comparable(configs)[0]) > 1:
             table = _cost_table(configs, identities, headline)
@@ -180,18 +177,17 @@ def same_protocol(results: Sequence[RunResult]) -> dict[tuple[str, str], list[Ru
     """(protocol, data) -> finished runs under it, whatever their profile and image size, where there are several."""
     found: dict[tuple[str, str], list[RunResult]] = {}
     for run in results:
-        if run.status == "done" and run.record["about"].get("fit_seconds") is not None:
-            name = "+".join(p for p in run.identity["protocol"].split("+") if not p.startswith("size="))
-            found.setdefault((name, run.data), []).append(run)
+        if run.status == "done" and run.timed:
+            found.setdefault((run.identity.protocol_without("size"), run.data), []).append(run)
     return {
         key: runs
         for key, runs in found.items()
-        if len({(run.identity["protocol"], run.identity["profile"]) for run in runs}) > 1
+        if len({(run.identity.protocol, run.identity.profile) for run in runs}) > 1
     }
 
 
-def _cost_table(configs: Sequence[Configuration], identities: Sequence[str], headline: str) -> list[Block]:
-    columns = [i for i in identities if Identity.parse(i).region == headline]
+def _cost_table(configs: Sequence[Configuration], identities: Sequence[Identity], headline: str) -> list[Block]:
+    columns = [i for i in identities if i.region == headline]
     all_rows, (configs, scenes) = configs, comparable(configs)
     points = {i: {p.configuration.label: p for p in work_points(configs, i, scenes)} for i in columns}
     columns = [i for i in columns if points[i]]
@@ -200,7 +196,7 @@ def _cost_table(configs: Sequence[Configuration], identities: Sequence[str], hea
         having = list(points[i].values())
         chosen = pareto_set([p.seconds.value for p in having], [p.error.value for p in having])
         for k in chosen:
-            best.setdefault(having[k].configuration.label, []).append(metric_of(i).title)
+            best.setdefault(having[k].configuration.label, []).append(i.display.title)
     on_gpu = any(_device_mb(run) > 0 for c in configs for run in c.runs)
     rows: list[tuple[Words, ...]] = []
     for c in configs:
@@ -210,7 +206,7 @@ def _cost_table(configs: Sequence[Configuration], identities: Sequence[str], hea
             str(len(runs)),
             _interval(seconds_interval(runs), "{:.3g}"),
             f"{seconds_interval(runs, 'total_seconds').value:.0f}",
-            f"{max(float(run.record['about']['peak_mb']) for run in runs):.0f}",
+            f"{max(run.about.peak_mb or 0.0 for run in runs):.0f}",
         ]
         cells += [f"{max(_device_mb(run) for run in runs):.0f}"] if on_gpu else []
         for i in columns:
@@ -218,7 +214,7 @@ def _cost_table(configs: Sequence[Configuration], identities: Sequence[str], hea
             cells.append("—" if point is None else _scored(point.value, i))
         cells.append(", ".join(best.get(c.label, [])) or "—")
         rows.append(tuple(cells))
-    metrics = [f"{metric_of(i).title} {metric_of(i).arrow}" for i in columns]
+    metrics = [f"{i.display.title} {i.display.arrow}" for i in columns]
     known = [seconds_interval([run for run in c.runs if run.scene in scenes]) for c in configs]
     kinds = sorted({interval.method for interval in known if math.isfinite(interval.low)})
     head = ["method", "runs", f"fit s [{SPREAD}]" if kinds else "fit s", "total s", "peak MB"]
@@ -249,16 +245,16 @@ def _quality_times(configs: Sequence[Configuration], headline: str, targets: Seq
 
 
 def _time_table(
-    configs: Sequence[Configuration], known: Sequence[str], headline: str, targets: Sequence[Target]
+    configs: Sequence[Configuration], known: Sequence[Identity], headline: str, targets: Sequence[Target]
 ) -> list[Block]:
     configs, scenes = comparable(configs)
     if not targets:
         targets = _chosen_targets(configs, known, headline)
-    columns: list[tuple[Target, str]] = []
+    columns: list[tuple[Target, Identity]] = []
     missing: list[Words] = []
     for target in targets:
         region = target.region or headline
-        found = [i for i in known if (Identity.parse(i).metric, Identity.parse(i).region) == (target.metric, region)]
+        found = [i for i in known if (i.metric, i.region) == (target.metric, region)]
         if found:
             columns.append((target, found[0]))
         else:
@@ -268,8 +264,8 @@ def _time_table(
     rows = [(c.label, *(_time_cell(c, target.value, i, scenes) for target, i in columns)) for c in configs]
     head = ["method"]
     for target, i in columns:
-        metric, sign = metric_of(i), "≥" if metric_of(i).higher_is_better else "≤"
-        where = "" if Identity.parse(i).region == headline else f" {Identity.parse(i).region}"
+        metric, sign = i.display, "≥" if i.display.higher_is_better else "≤"
+        where = "" if i.region == headline else f" {i.region}"
         unit = " dB" if metric.unit == "dB" else ""
         head.append(f"{metric.title}{where} {sign} {target.value * metric.scale:g}{unit}")
     views = standing(run for c in configs for run in c.runs)
@@ -289,17 +285,17 @@ def _time_table(
     ]
 
 
-def _chosen_targets(configs: Sequence[Configuration], known: Sequence[str], headline: str) -> list[Target]:
+def _chosen_targets(configs: Sequence[Configuration], known: Sequence[Identity], headline: str) -> list[Target]:
     chosen = []
     for metric in ON_THE_CURVE:
         for i in known:
-            if (Identity.parse(i).metric, Identity.parse(i).region) == (metric, headline):
+            if (i.metric, i.region) == (metric, headline):
                 chosen += [Target(metric, value) for value in _round_ones(configs, i)]
                 break
     return chosen
 
 
-def _round_ones(configs: Sequence[Configuration], identity: str) -> list[float]:
+def _round_ones(configs: Sequence[Configuration], identity: Identity) -> list[float]:
     """Round qualities that the curves pass, none that the table lacks as long as there are such."""
     every = [(c, scene, curve) for c in configs for (scene, _), curve in curves(c, identity).items()]
     kept = []
@@ -310,9 +306,9 @@ def _round_ones(configs: Sequence[Configuration], identity: str) -> list[float]:
     return round_targets(kept) or round_targets([curve for *_, curve in every])
 
 
-def _time_cell(configuration: Configuration, target: float, identity: str, scenes: Sequence[str]) -> str:
+def _time_cell(configuration: Configuration, target: float, identity: Identity, scenes: Sequence[str]) -> str:
     """Median seconds; with the views that it stands on wherever the table over all views says something else."""
-    found, metric = curves(configuration, identity), metric_of(identity)
+    found, metric = curves(configuration, identity), identity.display
     times = times_to(target, found, scenes)
     if not times:
         return "—"
@@ -336,10 +332,10 @@ def _time_cell(configuration: Configuration, target: float, identity: str, scene
     return f"{shown} {views}{says}" if says else shown
 
 
-def _end_table(configs: Sequence[Configuration], known: Sequence[str], headline: str) -> list[Block]:
+def _end_table(configs: Sequence[Configuration], known: Sequence[Identity], headline: str) -> list[Block]:
     """Where the curves end beside what the table has over all views; nothing where they agree as printed."""
     configs, scenes = comparable(configs)
-    columns = [i for i in known if Identity.parse(i).region == headline and Identity.parse(i).metric in ON_THE_CURVE]
+    columns = [i for i in known if i.region == headline and i.metric in ON_THE_CURVE]
     rows: list[tuple[Words, ...]] = []
     for c in configs:
         cells = [_end_cell(c, i, scenes) for i in columns]
@@ -352,7 +348,7 @@ def _end_table(configs: Sequence[Configuration], known: Sequence[str], headline:
         f"The last point of the curves, on {views} test views, and the same avatars over all test views, as in the "
         "table: mean over scenes of the mean over seeds. By so much the curves, the times and the areas are off."
     )
-    head = [f"{metric_of(i).title} {Identity.parse(i).region} {metric_of(i).arrow}" for i in columns]
+    head = [f"{i.display.title} {i.region} {i.display.arrow}" for i in columns]
     return [
         Heading(3, "Where the curves end, and what the table has"),
         Table(("method", *head), tuple(rows)),
@@ -360,9 +356,9 @@ def _end_table(configs: Sequence[Configuration], known: Sequence[str], headline:
     ]
 
 
-def _end_cell(configuration: Configuration, identity: str, scenes: Sequence[str]) -> str:
+def _end_cell(configuration: Configuration, identity: Identity, scenes: Sequence[str]) -> str:
     """ "20.21, in the table 17.80 (+2.41)"; "" where both are printed alike, or one is absent."""
-    metric = metric_of(identity)
+    metric = identity.display
     ends: dict[str, list[float]] = {}
     for (scene, _), curve in curves(configuration, identity).items():
         if scene in scenes:
@@ -376,12 +372,12 @@ def _end_cell(configuration: Configuration, identity: str, scenes: Sequence[str]
     return f"{metric.text(end)}, in the table {metric.text(whole)} ({sign}{metric.text(abs(end - whole))})"
 
 
-def _area_table(configs: Sequence[Configuration], known: Sequence[str]) -> list[Block]:
+def _area_table(configs: Sequence[Configuration], known: Sequence[Identity]) -> list[Block]:
     configs, scenes = comparable(configs)
-    columns: list[tuple[str, float, float]] = []
+    columns: list[tuple[Identity, float, float]] = []
     for metric in ON_THE_CURVE:
         for i in known:
-            if Identity.parse(i).metric != metric:
+            if i.metric != metric:
                 continue
             found = [v for c in configs for (scene, _), v in curves(c, i).items() if scene in scenes]
             start, end = common_window(found)
@@ -393,7 +389,7 @@ def _area_table(configs: Sequence[Configuration], known: Sequence[str]) -> list[
     for c in configs:
         cells = [_area_cell(curves(c, i), i, start, end, scenes) for i, start, end in columns]
         rows.append((c.label, *cells))
-    head = [f"{metric_of(i).title} {Identity.parse(i).region} {metric_of(i).arrow}" for i, _, _ in columns]
+    head = [f"{i.display.title} {i.region} {i.display.arrow}" for i, _, _ in columns]
     windows = sorted({f"{_seconds(start)} to {_seconds(end)}" for _, start, end in columns})
     told = (
         f"Mean of the metric over the logarithm of fitting time, from {'; '.join(windows)}: from the latest first "
@@ -405,14 +401,14 @@ def _area_table(configs: Sequence[Configuration], known: Sequence[str]) -> list[
 
 
 def _area_cell(
-    found: Mapping[tuple[str, int], QualityCurve], identity: str, start: float, end: float, scenes: Sequence[str]
+    found: Mapping[tuple[str, int], QualityCurve], identity: Identity, start: float, end: float, scenes: Sequence[str]
 ) -> str:
     by_scene: dict[str, list[float]] = {}
     for (scene, _), curve in found.items():
         area = area_under_curve(curve, start, end)
         if scene in scenes and math.isfinite(area):
             by_scene.setdefault(scene, []).append(area)
-    return metric_of(identity).text(mean_interval(by_scene, LEVEL).value) if by_scene else "—"
+    return identity.display.text(mean_interval(by_scene, LEVEL).value) if by_scene else "—"
 
 
 def _seconds(value: float, unit: str = " s") -> str:
@@ -426,10 +422,10 @@ def _interval(interval: Interval, form: str) -> str:
     return shown
 
 
-def _scored(interval: Interval, identity: str) -> str:
-    return metric_of(identity).text(interval.value)
+def _scored(interval: Interval, identity: Identity) -> str:
+    return identity.display.text(interval.value)
 
 
 def _device_mb(run: RunResult) -> float:
-    stages = (run.record.get("ledger") or {}).get("stages", {})
-    return max((float(stage.get("peak_device_mb") or 0) for stage in stages.values()), default=0.0)
+    stages = {} if run.record.ledger is None else run.record.ledger.stages
+    return max((stage.peak_device_mb or 0.0 for stage in stages.values()), default=0.0)

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 
 from ihbench.document.document import Block, Heading, Paragraph, Table, Words, bullets
 from ihbench.metrics import Identity, Mean, macro_mean
-from ihbench.metrics.identity import Metric, metric_of
+from ihbench.metrics.identity import Metric
 from ihbench.metrics.statistics import holm, mean_interval, paired_test, smallest_detectable_difference
 from ihbench.record.results import RunResult
 
@@ -21,11 +21,11 @@ POWER = 0.8
 
 def intervals_section(
     by_label: Mapping[str, Sequence[RunResult]],  # a table row's label -> its runs
-    identities: Sequence[str],
+    identities: Sequence[Identity],
     headline: str,
 ) -> list[Block]:
     """A table of means with intervals, and the comparisons; nothing where there is but one scene."""
-    columns = [i for i in identities if Identity.parse(i).region == headline]
+    columns = [i for i in identities if i.region == headline]
     values = {i: {label: per_scene(runs, i) for label, runs in by_label.items()} for i in columns}
     columns = [i for i in columns if any(len(found) >= 2 for found in values[i].values())]
     if not columns:
@@ -41,28 +41,28 @@ def intervals_section(
                 continue
             interval = mean_interval(found, LEVEL)
             methods.add(interval.method)
-            text = metric_of(i).text
+            text = i.display.text
             shown = text(interval.value)
             if math.isfinite(interval.low):
                 shown += f" [{text(interval.low)}, {text(interval.high)}]"
             cells.append(shown)
         rows.append((label, *cells))
-    head = ("method", *(f"{metric_of(i).title} {metric_of(i).arrow}" for i in columns))
+    head = ("method", *(f"{i.display.title} {i.display.arrow}" for i in columns))
     return [
         Heading(3, f"{headline}: mean over scenes and {LEVEL:.0%} interval"),
         Table(head, tuple(rows)),
         Paragraph(f"Intervals: {'; '.join(sorted(methods))}."),
-        *bullets([line for i in columns for line in _comparisons(values[i], metric_of(i))]),
+        *bullets([line for i in columns for line in _comparisons(values[i], i.display)]),
     ]
 
 
-def per_scene(runs: Sequence[RunResult], identity: str, row: str | None = None) -> dict[str, float]:
+def per_scene(runs: Sequence[RunResult], identity: Identity, row: str | None = None) -> dict[str, float]:
     """Scene -> mean over its runs (seeds); scenes without a finite number are left out."""
     found = scene_means(runs, identity, row)
     return {scene: mean.value for scene, mean in found.items() if math.isfinite(mean.value)}
 
 
-def scene_means(runs: Sequence[RunResult], identity: str, row: str | None = None) -> dict[str, Mean]:
+def scene_means(runs: Sequence[RunResult], identity: Identity, row: str | None = None) -> dict[str, Mean]:
     """Scene -> mean over its runs (seeds), absent and infinite ones included. `row` names another row of the runs'
     scores than the method's own, such as a calibration row or a group of test views."""
     by_scene: dict[str, dict[str, Mean]] = {}

@@ -104,7 +104,7 @@ def _check(choice: Choice, table: PaperTable, results: Sequence[RunResult]) -> d
     labels = {row.name: row.name for row in table.rows}
     for runs in _by_kind(table, results).values():
         labels |= {label: having[0].method for label, having in by_label(_configured(runs)).items()}
-    having = [Identity.parse(i) for run in results for scores in run.rows.values() for i in scores]
+    having = [i for run in results for scores in run.rows.values() for i in scores]
     choice.check(labels, [column.key for column in table.columns], [*REGIONS, *(i.region for i in having)])
     return choice.renamed(labels)
 
@@ -194,13 +194,13 @@ def _by_kind(table: PaperTable, results: Sequence[RunResult]) -> dict[tuple[str,
     by_kind: dict[tuple[str, str], list[RunResult]] = {}
     for run in results:
         if _protocol(run) in wanted:
-            by_kind.setdefault((run.record["about"]["standin"], run.identity["profile"]), []).append(run)
+            by_kind.setdefault((run.about.standin or "", run.identity.profile), []).append(run)
     return by_kind
 
 
 def _configured(runs: Sequence[RunResult]) -> list[RunResult]:
     """A run that failed early never said how it was configured: it is told of, but belongs to no row."""
-    return [run for run in runs if "changed" in run.record["about"]]
+    return [run for run in runs if run.about.changed is not None]
 
 
 def _measured(
@@ -228,7 +228,7 @@ def _measured(
 
 
 def _protocol(run: RunResult) -> str:
-    return run.identity["protocol"].partition("@")[0]
+    return run.identity.protocol_id
 
 
 def _comparable(group: Group, runs: Sequence[RunResult]) -> list[tuple[str, str, str, str]]:
@@ -257,14 +257,14 @@ def _measured_block(
             f"Made on {standin}: procedural people of the bench in the data set's layout, not the data set. These "
             "numbers compare rows of this block with each other and with nothing else."
         )
-    unlabelled = [run for run in everything if "changed" not in run.record["about"]]
+    unlabelled = [run for run in everything if run.about.changed is None]
     notes += [f"Not done: {run.method} on {_outcome(run)}." for run in unlabelled]
     columns: list[list[Number]] = []  # by column, then by row
     calibrations = choice.bounds([name for name in ROWS if any(name in run.rows for run in everything)])
     for group, runs in filled:
         done = [run for run in runs if run.status == "done"]
         here = {id(run) for run in runs}
-        shown_region = region or (done[0].record["about"]["headline"] if done else "")
+        shown_region = region or (done[0].headline if done else "")
         identities = [_identity(done, group, column.key, shown_region) for column in group.columns]
         notes += _about(group, runs, done, shown_region, identities)
         for column, identity in zip(group.columns, identities, strict=True):
@@ -312,32 +312,32 @@ def _measured_block(
     )
 
 
-def _identity(done: Sequence[RunResult], group: Group, metric: str, region: str) -> str:
+def _identity(done: Sequence[RunResult], group: Group, metric: str, region: str) -> Identity | None:
     """The first definition of a metric in a region that these runs have; one with numbers before one without."""
     found = [
         identity
         for run in done
         for identity in run.rows.get(group_row(run.method, group.views), {})
-        if Identity.parse(identity).metric == metric and Identity.parse(identity).region == region
+        if identity.metric == metric and identity.region == region
     ]
     present = [i for i in found if any(not m.absent for m in _means(done, i, group.views))]
-    return next(iter(present or found), "")
+    return next(iter(present or found), None)
 
 
-def _means(runs: Sequence[RunResult], identity: str, views: str) -> list[Mean]:
+def _means(runs: Sequence[RunResult], identity: Identity, views: str) -> list[Mean]:
     rows = [run.rows.get(group_row(run.method, views), {}) for run in runs]
     return [row[identity] for row in rows if identity in row]
 
 
 def _cell(
-    column: Column, runs: Sequence[RunResult], views: str, identity: str, kind: Kind, footnotes: Footnotes
+    column: Column, runs: Sequence[RunResult], views: str, identity: Identity | None, kind: Kind, footnotes: Footnotes
 ) -> tuple[Number, dict[str, float]]:
     """A method's cell, and its finite means by scene."""
     done = [run for run in runs if run.status == "done"]
     if not done:
         why = "; ".join(dict.fromkeys(_outcome(run) for run in runs)) or f"not run on {column.group}"
         return _absent(why, footnotes), {}
-    if not identity:
+    if identity is None:
         return _absent(f"{column.metric.title} was not computed in this region", footnotes), {}
     means = scene_means(done, identity, group_row(done[0].method, views))
     if not means:
@@ -351,17 +351,19 @@ def _cell(
 
 
 def _bound(
-    column: Column, done: Sequence[RunResult], row: str, identity: str, kind: Kind, footnotes: Footnotes
+    column: Column, done: Sequence[RunResult], row: str, identity: Identity | None, kind: Kind, footnotes: Footnotes
 ) -> Number:
     """A calibration row's cell: the same for every run on a scene."""
-    means = scene_means(done, identity, row)
-    if not means:
+    means = {} if identity is None else scene_means(done, identity, row)
+    if identity is None or not means:
         return _absent(f"not scored on {column.group}", footnotes)
     cell = _filled(column, means, identity, kind, footnotes)
     return replace(cell, interval="", low=math.nan, high=math.nan)
 
 
-def _filled(column: Column, means: Mapping[str, Mean], identity: str, kind: Kind, footnotes: Footnotes) -> Number:
+def _filled(
+    column: Column, means: Mapping[str, Mean], identity: Identity, kind: Kind, footnotes: Footnotes
+) -> Number:
     total, scale = macro_mean(means), column.metric.scale
     if total.absent:
         return _absent(total.reason, footnotes)
@@ -373,7 +375,7 @@ def _filled(column: Column, means: Mapping[str, Mean], identity: str, kind: Kind
         shown = f"[{column.text(low, value)}, {column.text(high, value)}]"
     letters = footnotes.of([f"over scenes: {total.note}"] if total.note else [])
     return Number(
-        column.text(value), value, MEASURED[kind], shown, low, high, max(len(finite), 1), identity=identity,
+        column.text(value), value, MEASURED[kind], shown, low, high, max(len(finite), 1), identity=str(identity),
         footnotes=letters,
     )  # fmt: skip
 
@@ -383,26 +385,30 @@ def _absent(reason: str, footnotes: Footnotes) -> Number:
 
 
 def _outcome(run: RunResult) -> str:
-    reason = f" ({run.record['reason']})" if run.record["reason"] else ""
-    return f"{run.scene}, seed {run.identity['seed']}: {run.status}{reason}"
+    reason = f" ({run.reason})" if run.reason else ""
+    return f"{run.scene}, seed {run.seed}: {run.status}{reason}"
 
 
 def _about(
-    group: Group, runs: Sequence[RunResult], done: Sequence[RunResult], region: str, identities: Sequence[str]
+    group: Group,
+    runs: Sequence[RunResult],
+    done: Sequence[RunResult],
+    region: str,
+    identities: Sequence[Identity | None],
 ) -> list[str]:
     """What the numbers of one data set are."""
     protocol, digest, _, data = runs[0].group
     scenes = sorted({run.scene for run in done})
-    subjects = runs[0].record["about"].get("protocol", {}).get("subjects", {})
-    whole = len(subjects.get("standin" if runs[0].record["about"]["standin"] else "names", ()))
+    subjects = runs[0].about.subjects
+    whole = len(subjects.standin if runs[0].about.standin else subjects.names)
     counted = f"{len(scenes)} of {whole} scenes" if whole else f"{len(scenes)} scenes"
-    seeds = sorted({run.identity["seed"] for run in done})
+    seeds = sorted({run.seed for run in done})
     views = f", views of training ({group.views})" if group.views else ""
     notes = [
         f"{group.name}: {protocol} (digest {digest}), {data}; region {region or 'none'}{views}; "
         f"{counted} ({', '.join(scenes) or 'none'}); seeds {', '.join(map(str, seeds)) or 'none'}."
     ]
-    known = [identity for identity in identities if identity]
+    known = [str(identity) for identity in identities if identity is not None]
     return [*notes, f"{group.name}: {', '.join(known)}."] if known else notes
 
 
@@ -412,21 +418,8 @@ def _about(
 def _components(components: Sequence[Component], runs: Sequence[RunResult]) -> tuple[str, ...]:
     """Which components these runs of one configuration had. A scene's plan may have left one out: then it is told as
     not there; where scenes differ, or where the method has no such switch, as unknown."""
-    configs = [_in_force(run) for run in runs]
+    configs = [run.switches for run in runs]
     return tuple(_one(component, configs) for component in components)
-
-
-def _in_force(run: RunResult) -> dict[str, Any]:
-    """Flat name -> value of the switches, as the scene's plan left them."""
-    return dict(_flat(run.identity.get("config", {}))) | run.planned
-
-
-def _flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for name, value in config.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
 
 
 def _one(component: Component, configs: Sequence[Mapping[str, Any]]) -> str:

@@ -12,6 +12,7 @@ import ihbench
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.files.atomic import read_json
+from ihbench.metrics import Identity
 from ihbench.runner.run_loop import RunRequest
 from ihbench.scene.data_source import locate
 from ihbench.scene.protocol import load_protocol
@@ -157,7 +158,7 @@ def test_frames_occlusion_and_size_are_those_of_the_command_line(call, bench, ma
     assert [view.frame for view in scene.train] == [0, 100, 200]
     assert scene.test[0].image.shape[0] == 48
     (scored,) = call("score", result.folder / "renders", scene="standin-1", name="theirs", profile="quick", **same)
-    own = "psnr/pooled/range1/full/v1"
+    own = Identity.parse("psnr/pooled/range1/full/v1")
     assert scored.rows["theirs"][own].value == pytest.approx(result.rows[mannequin][own].value, abs=0.02)
 
 

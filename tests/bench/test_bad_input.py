@@ -55,8 +55,8 @@ def refused(bench_with_run):
         assert {path.name for path in new} <= {"run.json", "lock"}
         for path in new:
             if path.name == "run.json":
-                record = read_json(path)
-                assert (record["status"], record["reason"]) == ("failed", line)
+                outcome = read_json(path)["outcome"]
+                assert (outcome["status"], outcome["reason"]) == ("failed", line)
         return line
 
     check.bench = bench_with_run

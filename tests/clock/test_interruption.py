@@ -99,7 +99,7 @@ def until(condition, seconds=60):
 
 def only_record(runs):
     (file,) = runs.glob("*/run.json")
-    return read_json(file)
+    return read_json(file)["outcome"]
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGINT", "SIGUSR1", "SIGXCPU"])
@@ -201,7 +201,7 @@ def test_a_killed_run_is_seen_as_interrupted_and_a_running_one_as_running(tmp_pa
         run.communicate()
     assert only_record(tmp_path)["status"] == "running"  # what it could say last
     seen = read_result(folder)
-    assert (seen.status, seen.record["reason"]) == ("interrupted", KILLED)
+    assert (seen.status, seen.reason) == ("interrupted", KILLED)
     assert [row["status"] for row in Index(tmp_path).query(status="interrupted")] == ["interrupted"]
     assert Index(tmp_path).query(status="running") == []
 
@@ -227,7 +227,7 @@ def test_workers_end_with_the_one_who_started_them_and_record_it(tmp_path, how):
         command.communicate(timeout=60)
     until(lambda: not any(map(alive, workers)))
     records = [read_json(file) for file in runs.glob("*/run.json")]
-    assert [(record["status"], record["reason"]) for record in records] == [
+    assert [(record["outcome"]["status"], record["outcome"]["reason"]) for record in records] == [
         ("interrupted", "interrupted by SIGTERM")
     ] * 2
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,19 +19,18 @@ from ihbench.record import provenance
 def test_identity_is_complete_and_fits_into_json():
     facts = machine.identity()
     json.dumps(atomic.encode(facts))
-    assert facts["cpu"]
-    assert 1 <= facts["cores_usable"] <= facts["cores"]
-    assert facts["memory_gb"] > 0.1
-    assert facts["python"] == ".".join(map(str, sys.version_info[:3]))
-    assert facts["torch"] == torch.__version__
+    assert facts.cpu
+    assert 1 <= facts.cores_usable <= facts.cores
+    assert facts.memory_gb > 0.1
+    assert facts.python == ".".join(map(str, sys.version_info[:3]))
+    assert facts.torch == torch.__version__
 
 
 def test_the_load_of_the_beginning_is_kept_beside_that_of_the_end():
-    before = machine.identity() | {"load_average": [7.0, 7.0, 7.0], "torch": None, "gpu": None}
-    after = machine.identity_at_end(before)
-    assert after["load_average"] == [7.0, 7.0, 7.0]
-    assert after["load_average_end"] == machine.identity()["load_average"]
-    assert after["torch"] == torch.__version__
+    after = replace(machine.identity(), load_average=(7.0, 7.0, 7.0), torch=None, gpu=None).at_end()
+    assert after.load_average == (7.0, 7.0, 7.0)
+    assert after.load_average_end == machine.identity().load_average
+    assert after.torch == torch.__version__
 
 
 def test_a_cpu_has_nothing_to_warm_up_and_torch_is_not_brought_for_it():
@@ -41,7 +41,7 @@ def test_a_cpu_has_nothing_to_warm_up_and_torch_is_not_brought_for_it():
 def test_identity_does_not_import_torch():
     code = (
         "import sys; from ihbench.clock import machine; facts = machine.identity(); machine.synchronize('cuda')\n"
-        "assert machine.peak_device_memory_mb() == 0 and facts['torch'] is None and 'torch' not in sys.modules"
+        "assert machine.peak_device_memory_mb() == 0 and facts.torch is None and 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 
@@ -86,10 +86,10 @@ def test_git_state_tells_clean_from_changed_and_ignores_foreign_checkouts(tmp_pa
     git(tmp_path, "commit", "-m", "b")
     clean = provenance.git_state(package)
     assert clean is not None
-    assert len(clean["commit"]) == 40
-    assert clean["dirty"] is False
+    assert len(clean.commit) == 40
+    assert clean.dirty is False
     (package / "__init__.py").write_text("changed")
-    assert provenance.git_state(package) == {**clean, "dirty": True}
+    assert provenance.git_state(package) == replace(clean, dirty=True)
 
 
 def test_versions_are_those_of_the_installed_packages():
@@ -108,6 +108,6 @@ def test_a_system_that_tells_nothing_is_no_error(monkeypatch):
         monkeypatch.setattr(machine.os, name, refuses, raising=False)
     monkeypatch.setattr(machine.Path, "read_text", refuses)
     about = machine.identity()
-    assert about["load_average"] is None
-    assert about["cores_usable"] >= 1
-    assert about["cpu"]
+    assert about.load_average is None
+    assert about.cores_usable >= 1
+    assert about.cpu

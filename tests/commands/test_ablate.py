@@ -13,6 +13,7 @@ import pytest
 
 from ihbench.clock.events import RolledBack, Warned
 from ihbench.clock.ledger import Ledger
+from ihbench.clock.machine import Machine
 from ihbench.clock.progress import Progress
 from ihbench.commands import ablate as ablate_command
 from ihbench.commands.ablate import AblateOptions
@@ -23,7 +24,9 @@ from ihbench.methods.inpainthuman.config import LEAST_TEXELS, PROFILES, QUICK
 from ihbench.methods.inpainthuman.method import InpaintHuman
 from ihbench.methods.inpainthuman.spec import SPEC, STAGE1
 from ihbench.methods.inpainthuman.studies.ladders import LADDERS
+from ihbench.metrics import Identity
 from ihbench.record.results import read_result
+from ihbench.record.schema import CurvePoint
 from ihbench.record.store import RunFolder
 from ihbench.runner import executor as cells_module
 from ihbench.runner.ablation import Comparison, Ladder, Rung, configured, grid, kept, set_on_all, shared_part
@@ -34,6 +37,7 @@ from ihbench.scene.data_source import DataSource
 from ihbench.scene.plan import SceneMeasure
 from ihbench.scene.protocol import load_protocol
 from tests.conftest import SCENES
+from tests.reports.fake_runs import about, identity, record
 
 TINY = ["texels=32", "levels=16", "decoder_width=32", "position_map=16"]
 
@@ -154,10 +158,10 @@ def the_table_holds_the_means_of_its_runs(bench, outcome, out):
     runs = [read_result(folder) for folder in bench.folders()]
     assert len(runs) == 4
     for steps in (2, 6):
-        own = [run for run in runs if run.identity["config"]["steps"] == steps]
+        own = [run for run in runs if run.identity.config["steps"] == steps]
         assert {run.scene for run in own} == set(SCENES)
-        for identity, score in table["rungs"][f"steps={steps}"]["scores"].items():
-            expected = sum(run.rows["inpainthuman"][identity].value for run in own) / 2
+        for name, score in table["rungs"][f"steps={steps}"]["scores"].items():
+            expected = sum(run.own[Identity.parse(name)].value for run in own) / 2
             assert score["mean"] == pytest.approx(expected)
     (comparison,) = table["comparisons"]
     first = next(iter(comparison["scores"]))
@@ -229,7 +233,7 @@ def test_rungs_that_begin_alike_share_their_first_stage_and_its_seconds(bench):
     assert ablate(apart, *alone, "--no-share", on=painted).status == 0
     mine, other = bench.folders()[1], apart.folders()[0]
     assert (mine / "scores.jsonl").read_bytes() == (other / "scores.jsonl").read_bytes()
-    steps = [[point["step"] for point in RunFolder.open(folder).curve()] for folder in (mine, other)]
+    steps = [[point.step for point in RunFolder.open(folder).curve()] for folder in (mine, other)]
     assert steps[0][-1] == steps[1][-1]
     events = [{e["kind"]: e["data"] for e in read_json(f / "run.json")["ledger"]["events"]} for f in bench.folders()]
     assert "shared" not in events[0]
@@ -240,12 +244,11 @@ def test_rungs_that_begin_alike_share_their_first_stage_and_its_seconds(bench):
 
 def test_nothing_is_lent_across_clocks_or_other_beginnings(tmp_path):
     """A state brings its seconds along: they must be of such a machine, with as many threads."""
-    here = {"cpu": "one", "gpu": None, "torch_threads": 1}
+    here = Machine(cpu="one", torch_threads=1)
 
     def run(name, machine=here, status="done", **config):
-        identity = {"seed": 0, "config": {"steps": 3, "inpaint": {"on": True}, "keep": [], **config}}
-        folder = RunFolder(tmp_path / name, {"status": status, "identity": identity, "machine": machine})
-        return folder
+        own = identity("a", "m", config={"steps": 3, "inpaint": {"on": True}, "keep": [], **config})
+        return RunFolder(tmp_path / name, record(own, about(), status, machine=machine))
 
     def found(lending):
         Ledger(tmp_path / "lends").save_state("stage1", {"x": np.zeros(3)}, {"step": 600})
@@ -256,7 +259,7 @@ def test_nothing_is_lent_across_clocks_or_other_beginnings(tmp_path):
     good = run("lends", inpaint={"on": False})
     assert found(good) is good
     for change in ({"torch_threads": 2}, {"cpu": "two"}, {"gpu": "some"}):
-        assert found(run("lends", here | change)) is None
+        assert found(run("lends", replace(here, **change))) is None
     assert found(run("lends", steps=4)) is None
     assert found(run("lends", keep=["levels"])) is None
     assert found(run("lends", status="failed")) is None
@@ -270,12 +273,11 @@ def test_what_happened_in_a_lent_stage_is_told_of_the_borrower_too(tmp_path):
     ledger.save_state("stage1", {"x": np.zeros(3)}, {"step": 600})
     ledger.event(RolledBack("stage3", 650, "…", 651))
     ledger.event(Warned("it rains"))
-    record = {"ledger": ledger.state()}
-    points = [{"step": 300}, {"step": 600}, {"step": 700}]
-    other = SimpleNamespace(path=lender, record=record, curve=lambda: points)
+    points = [CurvePoint(step, 1.0, {}) for step in (300, 600, 700)]
+    other = SimpleNamespace(path=lender, record=SimpleNamespace(events=ledger.events), curve=lambda: points)
     borrower.mkdir()
     events = lend(other, SimpleNamespace(path=borrower), "stage1")  # pyright: ignore
-    assert [(event["kind"], event["data"]["step"]) for event in events] == [("rolled_back", 25)]
+    assert [(event.kind, event.data["step"]) for event in events] == [("rolled_back", 25)]
     assert Ledger(borrower).load_state("stage1")[1] == {"step": 600}  # pyright: ignore
     assert len((borrower / "curve.jsonl").read_text().splitlines()) == 2
 

@@ -15,6 +15,7 @@ from ihbench.body.pose import BodyPose
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.files.atomic import read_json, read_json_lines
 from ihbench.files.splat_ply import read_splat_ply
+from ihbench.metrics import Identity
 from ihbench.record.results import read_result
 from ihbench.runner.run_loop import load_avatar
 from ihbench.scene.data_source import standin_root
@@ -347,4 +348,4 @@ def test_help_is_no_error_and_no_words_are_help(bench):
 def test_reports_and_runs_show_the_same_numbers(bench_with_run, finished):
     cells = table_row(bench_with_run("report", "--runs", bench_with_run.runs).out, "inpainthuman")
     assert cells == table_row(finished.outcome.out, "inpainthuman")
-    assert cells["**body**"] == f"{read_result(finished.folder).rows['inpainthuman'][BODY_PSNR].value:.2f}"
+    assert cells["**body**"] == f"{read_result(finished.folder).own[Identity.parse(BODY_PSNR)].value:.2f}"

@@ -56,7 +56,7 @@ def test_the_truth_is_perfect_in_every_metric_and_region(bench, truths):
         assert value in (perfect.get(identity.partition("/")[0]), "nan"), identity
         assert value != "nan" or identity.startswith("lpips") or run["scores"]["truth"][identity] == "nan"
     record = atomic.read_json(bench.folders()[0] / "run.json")
-    assert record["about"]["provenance"] == "predictions"
+    assert record["about"]["predictions"]["missing"] == []
     assert (bench.folders()[0] / "contact_sheet.png").is_file()
 
 

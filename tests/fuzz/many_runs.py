@@ -20,9 +20,9 @@ from ihbench.record import index
 from tests.fuzz.records import make_run
 
 SHAPES = {  # of the k-th run: method, scene, seed, changed switches
-    "10 rows": lambda k: (f"m{k % 10}", f"s{k // 10 % 6}", k // 60, ()),
-    "a row in 18 runs": lambda k: ("m", f"s{k % 6}", k // 6 % 3, (f"steps={k // 18}",)),
-    "a row each": lambda k: ("m", "s", 0, (f"steps={k}",)),
+    "10 rows": lambda k: (f"m{k % 10}", f"s{k // 10 % 6}", k // 60, {}),
+    "a row in 18 runs": lambda k: ("m", f"s{k % 6}", k // 6 % 3, {"steps": k // 18}),
+    "a row each": lambda k: ("m", "s", 0, {"steps": k}),
 }
 
 

@@ -7,10 +7,11 @@ import json
 import os
 import random
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from ihbench.cli import main
@@ -18,16 +19,19 @@ from ihbench.clock.events import Inpainted, Resumed
 from ihbench.clock.ledger import Ledger
 from ihbench.errors import BadInput
 from ihbench.files import atomic
+from ihbench.files.shape import as_json
 from ihbench.record.earlier_runs import earlier_runs
 from ihbench.record.index import Index
 from ihbench.record.reopen import reopen_body, reopen_capture, reopen_protocol
 from ihbench.record.results import read_result
+from ihbench.record.schema import CurvePoint, PredictionFiles, PresetHead, ScoreLine
 from ihbench.record.store import RunFolder
 from ihbench.reports.general import ablation
 from ihbench.runner.ablation import Comparison, Ladder, Rung
 from ihbench.runner.executor import Cell, CellOutcome
 from ihbench.runner.shared_states import lend, lender
-from tests.reports.fake_runs import LPIPS, PSNR, SSIM, about, identity
+from ihbench.scene.plan import Omission
+from tests.reports.fake_runs import LPIPS, about, identity, means
 
 MISSING = object()
 HUGE = "9" * 400
@@ -127,7 +131,7 @@ def _contents(file: Path) -> dict[str, bytes]:
         "NaN": data.replace(b": ", b': NaN, "x": ', 1),
         "overflow": data.replace(b": ", b': 1e999, "x": ', 1),
         "lone surrogate": data.replace(b'": "', b'": "\\ud800', 1),
-        "a newer version": data.replace(b'"schema_version": 1', b'"schema_version": 99', 1) + b" ",
+        "a newer version": data.replace(b'"schema_version": 2', b'"schema_version": 99', 1) + b" ",
     }
 
 
@@ -163,24 +167,20 @@ PLACES: dict[str, Callable[[Path], Any]] = {
 
 
 GOOD, VICTIM = "good", "victim"  # methods
+LEVELS = MappingProxyType({"levels": (16, 64)})
 
 
-def make_run(
-    runs: Path, method: str, scene: str = "a", seed: int = 0, changed: tuple[str, ...] = ("levels=16,64",)
-) -> Path:
+def make_run(runs: Path, method: str, scene: str = "a", seed: int = 0, changed: Mapping[str, Any] = LEVELS) -> Path:
     """A finished run that has everything a run folder may hold, but pictures and an avatar."""
-    left_out = [{"field": "steps", "value": 5, "reason": "still", "spares": {"fit/stage1": 0.5}},
-                {"field": "hidden", "value": None, "reason": "none", "spares": {}}]  # fmt: skip
+    left_out = Omission("steps", 5, "still", {"fit/stage1": 0.5}), Omission("hidden", None, "none")
+    files = PredictionFiles(missing=(), surplus=(), notes=("odd",), doubts=("BGR",), alpha="straight", views=4)
     told = about(
-        changed=list(changed), left_out=left_out, device="cpu", hidden_share=0.5, measure={"pixel_mm": 4.0},
-        body="procedural",
-        predictions={
-            **{"folder": "x", "pattern": "*", "missing": [], "surplus": [], "notes": ["odd"]},
-            **{"doubts": ["BGR"], "alpha": "straight", "views": 4},
-        },
+        changed=dict(changed), left_out=left_out, device="cpu", hidden_share=0.5, measure={"pixel_mm": 4.0},
+        body="procedural", predictions=files,
     )  # fmt: skip
-    told["protocol"] |= {"id": "zju_occ", "image": {"size": 64, "background": [1.0, 1.0, 1.0]}}
-    config = {"levels": [16, 64], "grid": {"on": True}, "rate": 1e-3, "keep": ["steps"], "set": list(changed)}
+    content = {**(told.protocol or {}), "id": "zju_occ", "image": {"size": 64, "background": [1.0, 1.0, 1.0]}}
+    told = replace(told, protocol=content)
+    config = {"levels": [16, 64], "grid": {"on": True}, "rate": 1e-3, "keep": ["steps"], "set": [*changed]}
     own = identity(scene, method, config=config, seed=seed)
     run = RunFolder.create(runs, own, told)
     ledger = Ledger()
@@ -190,31 +190,25 @@ def make_run(
     drift = {"delta_e": 3.0, "delta_e_floor": 1.0, "texture": 0.2, "texture_floor": float("nan")}
     ledger.event(Inpainted(**painted, identity_drift=drift))
     ledger.event(Resumed("stage1", 4))
-    run.record["machine"] |= {"load_average": [0.5, 0.5], "load_average_end": [0.7, 0.5]}
+    run.note_machine(replace(run.record.machine, load_average=(0.5, 0.5), load_average_end=(0.7, 0.5)))
     rows = {row: [_line(row, frame) for frame in (0, 1)] for row in (method, f"{method} [novel]", "truth")}
     rows["truth [novel]"] = [_line("truth [novel]", frame) for frame in (0, 1)]
     run.write_scores([*rows[method], *rows[f"{method} [novel]"]])
     calibration = [*rows["truth"], *rows["truth [novel]"]]
-    atomic.write_json_lines(run.path / "calibration.jsonl", calibration)
-    preset = [{"lacking": ["lpips"], "code": "1"}, *rows[method], *rows["truth"]]
+    atomic.write_json_lines(run.path / "calibration.jsonl", as_json(calibration))
+    preset = as_json([PresetHead(("lpips",), "1"), *rows[method], *rows["truth"]])
     atomic.write_json_lines(run.path / "presets" / "gauhuman.jsonl", preset)
     for step in (2, 4):
-        scores = {PSNR.format("body"): 10.0 + step, SSIM.format("body"): 0.5}
-        run.add_curve_point({"step": step, "seconds": float(step), "views": 2, "scores": scores})
+        scores = {i: m.value for i, m in means(10.0 + step, 0.5, 0.1).items()}
+        run.add_curve_point(CurvePoint(step, float(step), scores, views=2))
     run.set_status("done", ledger=ledger)
     return run.path
 
 
-def _line(row: str, frame: int) -> dict[str, Any]:
+def _line(row: str, frame: int) -> ScoreLine:
     value = float("inf") if row.startswith("truth") else 20.0 + frame
-    scores = {PSNR.format("body"): value, SSIM.format("body"): 0.9, LPIPS.format("body"): float("nan")}
-    return {
-        "row": row,
-        "camera": "c",
-        "frame": frame,
-        "scores": scores,
-        "absent": {LPIPS.format("body"): "no weights"},
-    }
+    scores = {identity: mean.value for identity, mean in means(value, 0.9).items()}
+    return ScoreLine(row, "c", frame, scores, {LPIPS.format("body"): "no weights"})
 
 
 def faults(store: Path, limit: int | None = None, seed: int = 0) -> Iterator[str]:
@@ -289,7 +283,7 @@ def _ablation(runs: Path, good: Path, victim: Path) -> None:
 
 
 def _borrow(runs: Path, good: Path, victim: Path) -> None:
-    borrower, here = RunFolder.open(good), RunFolder.open(good).record["machine"]
+    borrower, here = RunFolder.open(good), RunFolder.open(good).record.machine
     other = lender(runs, borrower, "stage1", ["levels"], here)
     if other is not None:
         lend(other, borrower, "stage1")
@@ -297,7 +291,7 @@ def _borrow(runs: Path, good: Path, victim: Path) -> None:
 
 def _go_on(runs: Path, good: Path, victim: Path) -> None:
     run = RunFolder.open(victim)
-    Ledger(state=run.record["ledger"]).table()
+    Ledger(state=as_json(run.record.ledger) if run.record.ledger else None).table()
     run.scores()
     run.curve()
 

@@ -55,7 +55,7 @@ def stop_clock(folder: Path) -> str:
     total = sum(stage["seconds"] for path, stage in stages.items() if "/" not in path) + 0.25
     record["ledger"] |= {"seconds": total, "events": []}
     record["about"] |= {"fit_seconds": stages["fit"]["seconds"], "total_seconds": total, "peak_mb": 100.0}
-    record |= {"created": "2025-01-01T00:00:00+00:00", "updated": "2025-01-01T00:00:22+00:00"}
+    record["outcome"] |= {"created": "2025-01-01T00:00:00+00:00", "updated": "2025-01-01T00:00:22+00:00"}
     record["machine"] |= {"cores": 4, "cores_usable": 4, "gpu": None}
     record["machine"] |= {"load_average": [0.5, 0.5, 0.5], "load_average_end": [0.5, 0.5, 0.5]}
     (folder / "run.json").write_text(json.dumps(record), encoding="utf-8")
@@ -69,8 +69,8 @@ def stop_clock(folder: Path) -> str:
 def structure(value: Any, path: str = "") -> Iterator[str]:
     """A line for every key path of a JSON value, with its type: `about.changed[]: str`."""
     if path in OPEN:
-        yield f"{path}: any"
-    elif isinstance(value, dict):
+        return
+    if isinstance(value, dict):
         for key, inside in value.items():
             yield from structure(inside, f"{path}.{key}".lstrip("."))
     elif isinstance(value, list):

@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+from dataclasses import asdict, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -206,7 +207,7 @@ def test_a_kernel_that_a_method_registers_is_measured_beside_the_benchs_own(monk
 
 @pytest.mark.parametrize(("load", "said"), [(9.0, True), (0.5, False)])
 def test_a_busy_machine_is_named_below_the_table(load, said):
-    about = table.machine.identity() | {"load_average": [load, 0.0, 0.0], "cores_usable": 2}
+    about = asdict(replace(table.machine.identity(), load_average=(load, 0.0, 0.0), cores_usable=2))
     assert ("times are unstable" in write(table.blocks_of(about, []), "terminal")) == said
 
 

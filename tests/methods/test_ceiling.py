@@ -12,6 +12,7 @@ import pytest
 from ihbench.methods.inpainthuman.inpainting.painted_view import PaintedView
 from ihbench.methods.inpainthuman.studies.ceiling import CeilingRow, painted_psnr, with_truth
 from ihbench.methods.inpainthuman.studies.ceiling_command import table
+from ihbench.metrics import Identity
 from ihbench.record.results import read_result
 from ihbench.scene.contracts import MaskState, TrainView
 from tests.bench.fake_capture import a_camera, a_pose
@@ -73,7 +74,7 @@ def test_a_run_between_its_first_stage_and_its_ceiling(bench, tmp_path):
         own = read_result(folder).rows["inpainthuman"]
         for identity, value in rows[name]["scores"].items():
             if value is not None:
-                assert value == pytest.approx(own[identity].value, abs=1e-6), (name, identity)
+                assert value == pytest.approx(own[Identity.parse(identity)].value, abs=1e-6), (name, identity)
     assert rows["true images"]["painted_psnr"] == "inf"
     assert 3 < rows["as painted"]["painted_psnr"] < 40
     hidden = [

@@ -15,26 +15,27 @@ from dataclasses import replace
 import pytest
 
 from ihbench.errors import BadInput
+from ihbench.metrics import Identity
 from ihbench.record import index
 from ihbench.record.index import Index
 from ihbench.record.results import read_result
+from ihbench.record.schema import ScoreLine
 from ihbench.record.store import RunFolder
 from tests.record.test_store import IDENTITY
 from tests.reports.fake_runs import about
 
-PSNR = "psnr/pooled/range1/body/v1"
-HIDDEN = "psnr/pooled/range1/hidden/v1"
+PSNR = Identity.parse("psnr/pooled/range1/body/v1")
+HIDDEN = Identity.parse("psnr/pooled/range1/hidden/v1")
 
 
 def finished(runs, values=(20.0, 30.0), **changes) -> RunFolder:
     run = RunFolder.create(runs, replace(IDENTITY, **changes), about())
     run.write_scores(
         [
-            {"row": "inpainthuman", "camera": "1", "frame": i, "scores": {PSNR: value, HIDDEN: math.nan},
-             "absent": {HIDDEN: "no truth"}}
+            ScoreLine("inpainthuman", "1", i, {PSNR: value, HIDDEN: math.nan}, {str(HIDDEN): "no truth"})
             for i, value in enumerate(values)
         ]
-    )  # fmt: skip
+    )
     run.set_status("done")
     return run
 
@@ -203,18 +204,17 @@ def test_hostile_folders_are_listed_and_break_nothing(tmp_path):
     for number, content in enumerate(contents):
         (tmp_path / f"bad{number}").mkdir()
         (tmp_path / f"bad{number}" / "run.json").write_text(content)
-    changes = [
-        {"identity": {}}, {"identity": {**good.identity, "seed": 10**30}},
-        {"identity": {**good.identity, "scene": {}}},
-    ]  # fmt: skip
+    record = json.loads((good.path / "run.json").read_text())
+    named = record["identity"]
+    changes = [{"identity": {}}, {"identity": {**named, "seed": 10**30}}, {"identity": {**named, "scene": {}}}]
     for number, change in enumerate(changes):
         (tmp_path / f"worse{number}").mkdir()
-        (tmp_path / f"worse{number}" / "run.json").write_text(json.dumps({**good.record, **change}))
+        (tmp_path / f"worse{number}" / "run.json").write_text(json.dumps({**record, **change}))
     for number, lines in enumerate(
         ["{", "[1]\n", '{"row": 1}\n', '{"scores": {"a": "x"}, "row": "m", "absent": {}}\n']
     ):
         (tmp_path / f"scores{number}").mkdir()
-        (tmp_path / f"scores{number}" / "run.json").write_text(json.dumps(good.record))
+        (tmp_path / f"scores{number}" / "run.json").write_text(json.dumps(record))
         (tmp_path / f"scores{number}" / "scores.jsonl").write_text(lines)
     for name in ("pipe", "link", "folder"):
         (tmp_path / name).mkdir()

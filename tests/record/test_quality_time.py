@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from ihbench.clock.ledger import Ledger
 from ihbench.errors import BadInput
+from ihbench.metrics import Identity
 from ihbench.record.quality_time import (
     NEVER,
     QualityCurve,
@@ -24,8 +25,9 @@ from ihbench.record.quality_time import (
     round_targets,
     time_to_quality,
 )
+from ihbench.record.schema import CurvePoint
 
-PSNR = "psnr/pooled/range1/body/v1"
+PSNR = Identity.parse("psnr/pooled/range1/body/v1")
 
 
 def curve(seconds, values, higher=True):
@@ -125,17 +127,17 @@ def test_the_common_window_is_where_every_curve_has_an_area():
 
 def test_a_curve_is_read_in_the_order_of_time_and_without_what_is_no_number():
     rows = [
-        {"seconds": 8.0, "scores": {PSNR: 20.0}},
-        {"seconds": 2.0, "scores": {PSNR: 10.0}},
-        {"seconds": 4.0, "scores": {PSNR: math.nan}},
-        {"seconds": 5.0, "scores": {}},
-        {"seconds": 0.0, "scores": {PSNR: 3.0}},
-        {"seconds": 8.0, "scores": {PSNR: 21.0}},
+        CurvePoint(0, 8.0, {PSNR: 20.0}),
+        CurvePoint(0, 2.0, {PSNR: 10.0}),
+        CurvePoint(0, 4.0, {PSNR: math.nan}),
+        CurvePoint(0, 5.0, {}),
+        CurvePoint(0, 0.0, {PSNR: 3.0}),
+        CurvePoint(0, 8.0, {PSNR: 21.0}),
     ]
-    found = curve_of(rows, PSNR, True)
+    found = curve_of(rows, PSNR)
     assert found.seconds.tolist() == [2, 8]
     assert found.values.tolist() == [10, 21]
-    assert not len(curve_of(rows, "ssim/x/range1/body/v1", True).values)
+    assert not len(curve_of(rows, Identity.parse("ssim/x/range1/body/v1")).values)
 
 
 @pytest.mark.parametrize("slow", [0.0, 1.0, 500.0])
@@ -146,7 +148,7 @@ def test_how_long_scoring_takes_does_not_move_the_curve(slow):
 
     def score(step, seconds, avatar):
         now[0] += slow
-        points.append({"step": step, "seconds": seconds, "scores": {PSNR: 10.0 + step}})
+        points.append(CurvePoint(step, seconds, {PSNR: 10.0 + step}))
 
     ledger = Ledger(clock=lambda: now[0], on_checkpoint=score)
     with ledger.stage("fit"):
@@ -154,7 +156,7 @@ def test_how_long_scoring_takes_does_not_move_the_curve(slow):
             now[0] += 1.0
             ledger.offer(step, "avatar")
         ledger.offer(20, "avatar", force=True)
-    found = curve_of(points, PSNR, True)
+    found = curve_of(points, PSNR)
     assert found.seconds.tolist() == [2, 4, 8, 16, 20]
     assert time_to_quality(found, 18) == pytest.approx(8)
     assert ledger.fit_seconds == 20
@@ -232,5 +234,5 @@ def test_values_that_no_metric_has_give_finite_or_absent_numbers_quietly(seed):
             assert math.isfinite(target)
         for value in values:
             assert error_of("psnr", float(value)) >= 0
-        points = [{"seconds": s, "scores": {PSNR: v}} for s, v in zip(seconds, values, strict=True)]
-        assert all(abs(v) <= 1e100 or v == math.inf for v in curve_of(points, PSNR, True).values)
+        points = [CurvePoint(0, float(s), {PSNR: float(v)}) for s, v in zip(seconds, values, strict=True)]
+        assert all(abs(v) <= 1e100 or v == math.inf for v in curve_of(points, PSNR).values)

@@ -6,6 +6,7 @@ import ast
 import os
 import shutil
 import sys
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.record import source_digest
 from ihbench.record.source_digest import bench_code, code_of, tree_digest
-from ihbench.record.store import RunFolder, identity_digest
+from ihbench.record.store import RunFolder, RunIdentity
 from ihbench.runner.shared_states import lender
 from ihbench.scene.protocol import load_protocol
 from ihbench.scoring.calibration import Calibration
@@ -315,7 +316,7 @@ def test_a_run_from_before_the_bench_was_hashed_is_readable_and_not_found(bench,
     os.replace(new, old)
     record = atomic.read_json(old / "run.json")
     record["identity"]["code"] = "0.1.0+c0ffee00"
-    record["digest"] = identity_digest(record["identity"])
+    record["digest"] = RunIdentity(**record["identity"]).digest
     atomic.write_json(old / "run.json", record)
     assert "mannequin" in bench("report", "--runs", bench.runs).out
     assert bench.run(method=mannequin).status == 0
@@ -354,11 +355,10 @@ def test_no_state_is_taken_from_a_run_of_other_code(bench, mannequin):
     assert bench.run("--seed", 0, method=mannequin).status == 0
     (folder,) = bench.folders()
     Ledger(folder).save_state("fit", {"x": np.zeros(1)}, {"step": 1})
-    here = atomic.read_json(folder / "run.json")["machine"]
-    borrower = RunFolder(bench.runs / "new", {"identity": dict(RunFolder.open(folder).identity)})
+    record = RunFolder.open(folder).record
+    borrower, here = RunFolder(bench.runs / "new", record), record.machine
     assert lender(bench.runs, borrower, "fit", (), here) is not None
-    borrower.identity["code"] += "1"
-    assert lender(bench.runs, borrower, "fit", (), here) is None
-    borrower.identity["code"] = borrower.identity["code"][:-1]
+    other = replace(record, identity=replace(record.identity, code=record.identity.code + "1"))
+    assert lender(bench.runs, RunFolder(bench.runs / "new", other), "fit", (), here) is None
     (folder / "checkpoints" / "fit.safetensors").write_bytes(b"")  # nor one that cannot be read
     assert lender(bench.runs, borrower, "fit", (), here) is None

@@ -8,7 +8,7 @@ import os
 import signal
 import subprocess
 import sys
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
@@ -18,7 +18,10 @@ from hypothesis import strategies as st
 from ihbench.clock.ledger import Ledger
 from ihbench.errors import BadInput
 from ihbench.files import locks
+from ihbench.files.shape import as_json
+from ihbench.metrics import Identity
 from ihbench.record import store
+from ihbench.record.schema import About, CurvePoint, ScoreLine
 from ihbench.record.store import RunFolder, RunIdentity
 
 IDENTITY = RunIdentity(
@@ -26,6 +29,8 @@ IDENTITY = RunIdentity(
     data="stand-in v1 seed 0", method="inpainthuman", config={"steps": 300, "rate": 1e-3, "levels": (64, 128)},
     profile="quick", seed=0, body="b0d7", code="1",
 )  # fmt: skip
+
+LINE = ScoreLine("inpainthuman", "1", 0, {}, {})
 
 
 def test_the_folder_is_named_by_what_the_run_is():
@@ -42,7 +47,7 @@ def test_the_digest_is_the_same_in_any_process():
 
 @pytest.mark.parametrize("field", [field.name for field in fields(RunIdentity)])
 def test_every_field_makes_another_run(field):
-    other = {"config": {**IDENTITY.config, "steps": 301}, "seed": 1}.get(field, "other")
+    other = {"config": {**IDENTITY.config, "steps": 301}, "seed": 1, "more": {"x": 1}}.get(field, "other")
     assert replace(IDENTITY, **{field: other}).digest != IDENTITY.digest
 
 
@@ -63,13 +68,13 @@ def test_names_that_become_equal_are_still_two_folders():
 
 
 def test_a_new_run_is_running_and_says_where_it_came_from(tmp_path):
-    run = RunFolder.create(tmp_path, IDENTITY, about={"standin": "stand-in v1"})
+    run = RunFolder.create(tmp_path, IDENTITY, about=About(standin="stand-in v1"))
     record = json.loads((tmp_path / IDENTITY.folder_name / "run.json").read_text())
-    assert record == run.record
-    assert record["schema_version"] == 1
-    assert record["status"] == "running"
+    assert RunFolder.open(run.path).record == run.record
+    assert record["schema_version"] == 2
+    assert record["outcome"]["status"] == "running"
     assert record["identity"]["config"]["levels"] == [64, 128]
-    assert record["about"] == {"standin": "stand-in v1"}
+    assert record["about"] == {"standin": "stand-in v1", "device": "cpu", "command": []}
     assert record["machine"]["cores"] >= 1
     assert {"ihbench", "git", "packages"} <= record["provenance"].keys()
     assert not run.finished
@@ -80,7 +85,7 @@ def test_a_new_run_is_running_and_says_where_it_came_from(tmp_path):
 )
 def test_names_and_values_that_json_lacks_come_back(tmp_path, change):
     made = RunFolder.create(tmp_path, replace(IDENTITY, **change))
-    assert RunFolder.open(made.path).record["digest"] == made.record["digest"]
+    assert RunFolder.open(made.path).record.digest == made.record.digest
 
 
 def test_a_finished_run_is_found_not_made_again(tmp_path):
@@ -88,13 +93,12 @@ def test_a_finished_run_is_found_not_made_again(tmp_path):
     ledger = Ledger()
     with ledger.stage("fit"):
         pass
-    run.write_scores([{"row": "inpainthuman", "camera": "1", "frame": 0, "scores": {}, "absent": {}}])
+    run.write_scores([LINE])
     run.set_status("done", ledger=ledger)
     again = RunFolder.create(tmp_path, IDENTITY)
     assert again.finished
     assert again.scores() == run.scores() != []
-    assert [row["stage"] for row in again.record["ledger"]["table"]] == ["fit", "other", "total"]
-    assert Ledger(state=again.record["ledger"]).seconds >= ledger.state()["stages"]["fit"]["seconds"]
+    assert Ledger(state=as_json(again.record.ledger)).seconds >= ledger.state()["stages"]["fit"]["seconds"]
 
 
 @pytest.mark.parametrize("status", store.STATUSES)
@@ -115,7 +119,7 @@ def test_an_unknown_status_is_refused(tmp_path):
 def test_force_begins_again_but_follows_no_links(tmp_path):
     run = RunFolder.create(tmp_path / "runs", IDENTITY)
     run.set_status("done")
-    run.write_scores([{"a": 1}])
+    run.write_scores([LINE])
     run.renders.mkdir()
     (tmp_path / "precious").mkdir()
     (tmp_path / "precious" / "file").write_text("x")
@@ -160,12 +164,11 @@ def test_a_runs_folder_that_is_a_file_is_said(tmp_path):
 
 def test_force_does_not_empty_a_run_in_use(tmp_path, monkeypatch):
     run = RunFolder.create(tmp_path, IDENTITY)
-    line = {"row": "inpainthuman", "camera": "1", "frame": 0, "scores": {}, "absent": {}}
-    run.write_scores([line])
+    run.write_scores([LINE])
     monkeypatch.setattr(locks, "WAIT", 0.0)
     with run.lock(), pytest.raises(BadInput, match=f"being written by process {os.getpid()};"):
         RunFolder.create(tmp_path, IDENTITY, force=True)
-    assert run.scores() == [line]
+    assert run.scores() == [LINE]
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", "{}", '{"schema_version": 1}', '{"schema_version": "1"}'])
@@ -178,15 +181,19 @@ def test_a_damaged_record_is_said_on_reading_and_started_again_on_writing(tmp_pa
     assert "\n" not in str(caught.value)
     again = RunFolder.create(tmp_path, IDENTITY)
     assert again.status == "running"
-    assert "damaged" in again.record["warnings"][0]
+    assert "damaged" in again.record.warnings[0]
     assert (run.path / "run.json.damaged").read_text() == content
     assert run.checkpoints.is_dir()
 
 
+def edit(run: RunFolder, **parts) -> None:
+    file = run.path / "run.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | parts))
+
+
 def test_a_record_of_a_newer_version_is_left_alone(tmp_path):
     run = RunFolder.create(tmp_path, IDENTITY)
-    run.record["schema_version"] = 2
-    run.save()
+    edit(run, schema_version=99)
     before = (run.path / "run.json").read_bytes()
     for attempt in (lambda: RunFolder.open(run.path), lambda: RunFolder.create(tmp_path, IDENTITY)):
         with pytest.raises(BadInput, match="newer"):
@@ -194,24 +201,40 @@ def test_a_record_of_a_newer_version_is_left_alone(tmp_path):
     assert (run.path / "run.json").read_bytes() == before
 
 
-def test_older_records_are_brought_up_step_by_step(tmp_path, monkeypatch):
+def test_a_record_of_schema_1_is_read_as_what_it_said_and_written_as_schema_2(tmp_path):
+    (tmp_path / "run.json").write_bytes((Path(__file__).parent / "schema_1.json").read_bytes())
+    run = RunFolder.open(tmp_path)
+    record = run.record
+    assert (record.outcome.status, record.digest, record.identity.digest) == ("done", "549e535312", "549e535312")
+    assert record.about.changed == {"levels": [16, 64], "grid.on": True, "keep": ["steps"]}
+    assert record.about.differences == ["levels=(16, 64)", "grid.on=True", "keep=steps"]
+    assert [(o.field, o.value, o.spares) for o in record.about.left_out] == [
+        ("steps", 5, {"fit/stage1": 0.5}), ("hidden", None, {}),
+    ]  # fmt: skip
+    assert (record.about.predictions.notes, record.about.subjects.names) == (("odd",), ("a", "b", "c", "d"))
+    assert [event.kind for event in record.events] == ["inpainted", "resumed"]
+    assert (record.ledger.stages["fit"].entered, record.machine.load_average_end) == (1, (0.7, 0.5))
+    run.save()
+    assert json.loads((tmp_path / "run.json").read_text())["schema_version"] == 2
+    assert RunFolder.open(tmp_path).record == run.record
+
+
+def test_what_another_version_says_besides_stays(tmp_path):
     run = RunFolder.create(tmp_path, IDENTITY)
-    monkeypatch.setattr(store, "SCHEMA_VERSION", 3)
-    monkeypatch.setattr(
-        store, "MIGRATIONS", {1: lambda r: {**r, "seen": [1]}, 2: lambda r: {**r, "seen": [*r["seen"], 2]}}
-    )
-    assert RunFolder.open(run.path).record["seen"] == [1, 2]
+    edit(run, mood="good", about={"device": "cpu", "weather": {"rain": 1}})
+    again = RunFolder.open(run.path)
+    again.warn("x")
+    record = json.loads((run.path / "run.json").read_text())
+    assert (record["mood"], record["about"]["weather"]) == ("good", {"rain": 1})
 
 
 def test_another_run_under_the_same_name_is_not_overwritten(tmp_path):
     run = RunFolder.create(tmp_path, IDENTITY)
     other = replace(IDENTITY, config={"steps": 999})
-    run.record |= {"identity": json.loads(json.dumps(asdict(other))), "digest": other.digest}
-    run.save()
+    edit(run, identity=as_json(other), digest=other.digest)
     with pytest.raises(BadInput, match="another run"):
         RunFolder.create(tmp_path, IDENTITY)
-    run.record["identity"]["config"]["steps"] = 998
-    run.save()
+    edit(run, identity=as_json(replace(other, config={"steps": 998})))
     with pytest.raises(BadInput, match="not the one of its digest"):
         RunFolder.create(tmp_path, IDENTITY)
 
@@ -222,24 +245,24 @@ def test_a_folder_without_a_record_is_no_run(tmp_path):
 
 
 def test_the_curve_grows_and_can_be_rewound(tmp_path):
-    run, psnr = RunFolder.create(tmp_path, IDENTITY), "psnr/pooled/range1/body/v1"
+    run, psnr = RunFolder.create(tmp_path, IDENTITY), Identity.parse("psnr/pooled/range1/body/v1")
     assert run.curve() == []
     for seconds in (2.0, 4.0, 8.0):
-        run.add_curve_point({"step": int(seconds), "seconds": seconds, "scores": {psnr: float("inf")}})
-    run.add_curve_point({"step": 4, "seconds": 5.0, "scores": {}})  # a resumed fit comes by again
-    assert [(point["step"], point["seconds"]) for point in run.curve()] == [(2, 2.0), (4, 5.0)]
-    assert run.curve()[0]["scores"][psnr] == float("inf")
+        run.add_curve_point(CurvePoint(int(seconds), seconds, {psnr: float("inf")}))
+    run.add_curve_point(CurvePoint(4, 5.0, {}))  # a resumed fit comes by again
+    assert [(point.step, point.seconds) for point in run.curve()] == [(2, 2.0), (4, 5.0)]
+    assert run.curve()[0].scores[psnr] == float("inf")
     (run.path / "curve.jsonl").write_text("{}\n")
-    run.add_curve_point({"step": 9, "seconds": 9.0, "scores": {}})  # the fit goes on beside a damaged file
-    assert [point["step"] for point in run.curve()] == [9]
-    assert "step is missing" in run.record["warnings"][0]
+    run.add_curve_point(CurvePoint(9, 9.0, {}))  # the fit goes on beside a damaged file
+    assert [point.step for point in run.curve()] == [9]
+    assert "step is missing" in run.record.warnings[0]
 
 
 def test_warnings_are_kept_once(tmp_path):
     run = RunFolder.create(tmp_path, IDENTITY)
     run.warn("slow")
     run.warn("slow")
-    assert RunFolder.open(run.path).record["warnings"] == ["slow"]
+    assert RunFolder.open(run.path).record.warnings == ("slow",)
 
 
 # --- locks ---
@@ -295,6 +318,6 @@ def test_the_lock_shows_what_a_rival_finished_meanwhile_and_clears_its_strays(tm
 
 
 def test_importing_the_store_is_cheap():
-    heavy = "{'torch', 'cv2', 'rich', 'numba'}"
+    heavy = "{'torch', 'cv2', 'rich', 'numba', 'pandas'}"
     code = f"import sys; import ihbench.metrics, ihbench.record.index; assert not {heavy} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)

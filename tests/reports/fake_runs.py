@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from ihbench.clock.machine import Machine
 from ihbench.files import atomic
-from ihbench.metrics import Mean
+from ihbench.files.shape import as_json
+from ihbench.metrics import Identity, Mean
+from ihbench.record.provenance import Provenance
 from ihbench.record.results import RunResult
-from ihbench.record.store import RunFolder, RunIdentity
+from ihbench.record.schema import About, Outcome, RunIdentity, RunRecord, ScoreLine, Status
+from ihbench.record.store import RunFolder
 
 PSNR, SSIM, LPIPS = "psnr/pooled/range1/{}/v1", "ssim/gauss11-1.5/range1/{}/v1", "lpips/vgg0.1/range-1,1/{}/v1"
 STANDIN = "stand-in v1 seed 0"
 SUBJECTS = ("a", "b", "c", "d")
+UNKNOWN_MACHINE = Machine()
 
 
 def identity(scene: str, method: str, **changes: Any) -> RunIdentity:
@@ -25,20 +31,34 @@ def identity(scene: str, method: str, **changes: Any) -> RunIdentity:
     return RunIdentity(**fields | changes)
 
 
-def about(**changes: Any) -> dict[str, Any]:
+def about(**changes: Any) -> About:
     subjects = {"names": list(SUBJECTS), "standin": list(SUBJECTS)}
-    return {
-        "standin": STANDIN, "variant": "original", "headline": "body", "changed": [], "left_out": [],
+    fields: dict[str, Any] = {
+        "standin": STANDIN, "variant": "original", "headline": "body", "changed": {}, "left_out": (),
         "fit_seconds": 10.0, "total_seconds": 20.0, "peak_mb": 100.0, "protocol": {"subjects": subjects},
-    } | changes  # fmt: skip
+    }  # fmt: skip
+    return About(**fields | changes)
 
 
-def means(psnr: float, ssim: float, lpips: float = math.nan, region: str = "body") -> dict[str, Mean]:
-    found = {}
+def record(
+    named: RunIdentity, said: About, status: Status = "done", reason: str = "", machine: Machine = UNKNOWN_MACHINE
+) -> RunRecord:
+    outcome = Outcome(status, reason, created="2025-01-01T00:00:00+00:00")
+    return RunRecord(named.digest, outcome, named, said, machine, Provenance())
+
+
+def with_about(run: RunResult, **changes: Any) -> RunResult:
+    return replace(run, record=replace(run.record, about=replace(run.about, **changes)))
+
+
+def mean(identity: str, value: float, reason: str = "", n: int = 4, **counts: int) -> Mapping[Identity, Mean]:
+    return {Identity.parse(identity): Mean(value, identity, reason, n=n, **counts)}
+
+
+def means(psnr: float, ssim: float, lpips: float = math.nan, region: str = "body") -> dict[Identity, Mean]:
+    found: dict[Identity, Mean] = {}
     for name, value in ((PSNR, psnr), (SSIM, ssim), (LPIPS, lpips)):
-        found[name.format(region)] = Mean(
-            value, name.format(region), "weights are not there" if math.isnan(value) else "", n=4
-        )
+        found |= mean(name.format(region), value, "weights are not there" if math.isnan(value) else "")
     return found
 
 
@@ -50,26 +70,24 @@ def fake_run(
     lpips: float = math.nan,
     *,
     views: Mapping[str, tuple[float, float]] | None = None,  # further groups of test views -> PSNR, SSIM
-    status: str = "done",
+    status: Status = "done",
     reason: str = "",
     who: Mapping[str, Any] | None = None,  # of the identity
     said: Mapping[str, Any] | None = None,  # of the record's "about"
 ) -> RunResult:
     """A run whose numbers are these; with a truth row beside it."""
-    named = identity(scene, method, **who or {})
     rows = {method: means(psnr, ssim, lpips), "truth": means(math.inf, 1.0, 0.0)}
     rows |= {f"{method} [{name}]": means(*values) for name, values in (views or {}).items()}
-    record = {"status": status, "reason": reason, "identity": vars(named), "about": about(**said or {})}
-    return RunResult(Path("runs") / scene, record, rows if status == "done" else {})
+    told = record(identity(scene, method, **who or {}), about(**said or {}), status, reason)
+    return RunResult(Path("runs") / scene, told, rows if status == "done" else {})
 
 
 def write_run(runs: Path, scene: str, method: str, psnr: float, ssim: float, **changes: Any) -> Path:
     """A run folder with one test view."""
     folder = RunFolder.create(runs, identity(scene, method, **changes), about())
-    values = {PSNR.format("body"): psnr, SSIM.format("body"): ssim, LPIPS.format("body"): math.nan}
-    absent = {LPIPS.format("body"): "weights are not there"}
-    row = {"row": method, "camera": 1, "frame": 0, "scores": values, "absent": absent}
-    folder.write_scores([row])
-    atomic.write_json_lines(folder.path / "calibration.jsonl", [row | {"row": "truth"}])
+    values = {identity: mean.value for identity, mean in means(psnr, ssim).items()}
+    line = ScoreLine(method, 1, 0, values, {LPIPS.format("body"): "weights are not there"})
+    folder.write_scores([line])
+    atomic.write_json_lines(folder.path / "calibration.jsonl", as_json([replace(line, row="truth")]))
     folder.set_status("done")
     return folder.path

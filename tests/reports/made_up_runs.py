@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
+from dataclasses import replace
 from datetime import datetime, timedelta
 from pathlib import Path
 
-from ihbench.metrics import Mean
+from ihbench.clock.machine import Machine
 from ihbench.record.results import RunResult
-from ihbench.record.schema import curve_points
+from ihbench.record.schema import About, LedgerState, Outcome, RunIdentity, Stage, curve_points
+from tests.reports.fake_runs import mean, record
 
 PSNR, FLIP = "psnr/pooled/range1/{}/v1", "flip/ldr-67ppd/srgb/{}/v1"
 REGIONS = ("body", "hidden")
-QUIET = {"cpu": "a processor", "cores": 4, "cores_usable": 4, "gpu": None, "load_average": [0.5, 0.5, 0.5]}
+QUIET = Machine(cpu="a processor", cores=4, cores_usable=4, load_average=(0.5, 0.5, 0.5))
 BEGAN = datetime.fromisoformat("2025-01-01T00:00:00+00:00")
 
 
@@ -25,7 +28,7 @@ def made_up(
     *,
     psnr=25.0,
     fit=40.0,
-    changed=(),
+    changed: Mapping[str, object] | None = None,
     config=None,
     curve=((2.0, 15.0), (4.0, 18.0), (8.0, 21.0), (16.0, 23.0)),  # seconds, PSNR
     stages=None,
@@ -42,7 +45,16 @@ def made_up(
     stamped=None,  # s between the record's time stamps; None agrees with the ledger
 ) -> RunResult:
     """A run whose regions all have the same PSNR, and FLIP = 10 / PSNR. Its folder holds nothing but the curve."""
-    name = "-".join([scene, method, str(seed), profile, str(size), *(c.replace("/", "_") for c in changed)])
+    name = "-".join(
+        [
+            scene,
+            method,
+            str(seed),
+            profile,
+            str(size),
+            *(f"{n}={v}".replace("/", "_") for n, v in (changed or {}).items()),
+        ]
+    )
     path = folder / name
     path.mkdir(parents=True, exist_ok=True)
     if curve is not None:
@@ -57,32 +69,24 @@ def made_up(
     means = {}
     for region in REGIONS:
         for identity, value in ((PSNR.format(region), psnr), (FLIP.format(region), 10 / psnr)):
-            means[identity] = Mean(value, identity, "" if math.isfinite(value) else "nothing there", n=4)
+            means |= mean(identity, value, "" if math.isfinite(value) else "nothing there")
     spent = {"load": 1.0, "fit": fit, "fit/stage1": fit - 1.0, "evaluate": 3.0, "score": 2.0, **(stages or {})}
     wall = sum(s for path_, s in spent.items() if "/" not in path_) + unnamed
     took = timedelta(seconds=round(wall if stamped is None else stamped))
-    record = {
-        "status": "done",
-        "reason": "",
-        "created": BEGAN.isoformat(),
-        "updated": (BEGAN + took).isoformat(),
-        "machine": QUIET | (machine or {}),
-        "identity": {
-            "protocol": protocol, "protocol_digest": f"{protocol}{profile}{size}", "profile": profile, "scene": scene,
-            "method": method, "seed": seed, "code": "1", "config": config or {},
-        },
-        "about": {
-            "standin": standin, "variant": "v", "headline": "body", "changed": list(changed), "left_out": [],
-            "fit_seconds": fit, "total_seconds": wall, "peak_mb": 100.0, "device": device,
-            "protocol": {"image": {"size": size}},
-        },
-        "ledger": {
-            "seconds": wall, "events": list(events),
-            "stages": {k: {"seconds": s, "entered": 1, "peak_device_mb": 0.0} for k, s in spent.items()},
-        },
-    }  # fmt: skip
+    who = RunIdentity(
+        protocol, f"{protocol}{profile}{size}", "d", scene, "x", method, config or {}, profile, seed, "0", "1"
+    )
+    said = About(
+        standin=standin, variant="v", headline="body", changed=changed or {}, left_out=(), fit_seconds=fit,
+        total_seconds=wall, peak_mb=100.0, device=device, protocol={"image": {"size": size}},
+    )  # fmt: skip
+    told = replace(
+        record(who, said, machine=replace(QUIET, **(machine or {}))),
+        outcome=Outcome("done", "", created=BEGAN.isoformat(), updated=(BEGAN + took).isoformat()),
+        ledger=LedgerState({path_: Stage(s) for path_, s in spent.items()}, wall, 0.0, tuple(events)),
+    )
     points = curve_points(path / "curve.jsonl") if curve is not None else []
-    return RunResult(path, record, {method: means}, curve=points)
+    return RunResult(path, told, {method: means}, curve=points)
 
 
 def sweep(folder: Path, scenes=("a", "b"), seeds=(0,)) -> list[RunResult]:
@@ -92,10 +96,10 @@ def sweep(folder: Path, scenes=("a", "b"), seeds=(0,)) -> list[RunResult]:
         for seed in seeds:
             shift = 0.3 * k + 0.1 * seed
             for steps, fit, psnr in ((50, 20, 22), (100, 40, 25), (200, 80, 26)):
-                changed = () if steps == 100 else (f"steps={steps}",)
+                changed = {} if steps == 100 else {"steps": steps}
                 runs.append(_one(folder, scene, seed, fit + shift, psnr + shift, changed, steps, 16))
             for texels, fit, psnr in ((8, 25, 21), (32, 95, 25.5)):
-                runs.append(_one(folder, scene, seed, fit + shift, psnr + shift, (f"texels={texels}",), 100, texels))
+                runs.append(_one(folder, scene, seed, fit + shift, psnr + shift, {"texels": texels}, 100, texels))
             runs.append(made_up(folder, scene, "theirs", seed, fit=300 + shift, psnr=24 + shift))
     return runs
 

@@ -9,6 +9,8 @@ import pytest
 from ihbench.document.markdown import write as markdown
 from ihbench.reports.general.ablation import write
 from ihbench.runner.ablation import Comparison, Ladder, Rung
+from ihbench.scene.plan import Omission
+from tests.reports.fake_runs import with_about
 from tests.reports.made_up_runs import made_up
 
 SCENES = tuple("abcdef")
@@ -54,7 +56,7 @@ def test_with_too_many_comparisons_for_the_scenes_it_says_so(tmp_path):
 def test_what_one_rung_lost_is_not_compared(tmp_path):
     """Seed 1 is a decibel better in every scene; a rung that lost it in one scene is not worse for that."""
     high = rung(tmp_path, 20, seeds=(0, 1))
-    low = [run for run in rung(tmp_path, 20, seeds=(0, 1)) if (run.scene, run.identity["seed"]) != ("a", 1)]
+    low = [run for run in rung(tmp_path, 20, seeds=(0, 1)) if (run.scene, run.seed) != ("a", 1)]
     _, table = told({"low": [*low, None], "high": high})
     score = table["comparisons"][0]["scores"][IDENTITY]
     assert (score["mean"], score["low"], score["high"]) == pytest.approx((0, 0, 0))
@@ -88,7 +90,7 @@ def test_seconds_are_compared_with_an_interval_and_as_a_share(tmp_path):
 
 
 def test_seconds_of_two_clocks_are_not_compared(tmp_path):
-    other = {"cpu": "a slower one", "load_average": [40.0, 1.0, 1.0]}
+    other = {"cpu": "a slower one", "load_average": (40.0, 1.0, 1.0)}
     text, table = told({"low": rung(tmp_path, 20, fit=100), "high": rung(tmp_path, 22, fit=400, machine=other)})
     assert table["comparisons"][0]["fit_seconds"] is None
     assert (table["rungs"]["low"]["fit_seconds"]["mean"], table["rungs"]["high"]["fit_seconds"]["mean"]) == (100, 400)
@@ -99,12 +101,9 @@ def test_seconds_of_two_clocks_are_not_compared(tmp_path):
 
 
 def test_what_the_plan_left_out_of_a_rung_is_said(tmp_path):
+    left_out = Omission("levels", [64, 128], "small"), Omission("never_seen", None, "no such surface")
     high = rung(tmp_path, 22)
-    for run in high[:2]:
-        run.record["about"]["left_out"] = [
-            {"field": "levels", "value": [64, 128], "reason": "small"},
-            {"field": "never_seen", "value": None, "reason": "no such surface"},
-        ]
+    high[:2] = [with_about(run, left_out=left_out) for run in high[:2]]
     text, table = told({"low": rung(tmp_path, 20), "high": high})
     assert "- left out by the plan, high: levels → 64+128 in 2 of 6 runs\n" in text
     assert table["rungs"]["high"]["left_out"] == {"levels → 64+128": 2}

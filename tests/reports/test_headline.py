@@ -31,7 +31,7 @@ def test_methods_come_first_then_what_bounds_them():
 @pytest.mark.parametrize("width", [10, 40, 61, 80, 200])
 def test_no_line_is_wider_than_the_terminal_or_80_columns(width):
     long = "日本語" * 40
-    changes = {"changed": [f"switch={k}" for k in range(40)]}
+    changes = {"changed": {f"s{k}": k for k in range(40)}}
     runs = [
         fake_run(long, long, said=changes),
         fake_run("b", "x" * 300, lpips=0.12345, views={"novel " + long: (20.0, 0.5)}),

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+from ihbench.clock.events import Event
 from ihbench.document.markdown import write as markdown
 from ihbench.record.results import RunResult
+from ihbench.record.schema import LedgerState
 from ihbench.reports.general.inpainting import inpainting_section
+from tests.reports.fake_runs import about, identity, record
 
 
 def event(delta_e, views=3):
     drift = {"delta_e": delta_e, "delta_e_floor": 2.0, "texture": float("nan"), "texture_floor": 1.0}
     flicker = {"deviation": 0.04, "deviation_floor": 0.02}
     data = {"views": views, "of": 10, "pixels": 100, "identity_drift": drift, "flicker": flicker}
-    return {"kind": "inpainted", "data": data}
+    return Event("inpainted", data=data)
 
 
-def run(*events, stages=None):
-    identity = {"scene": "standin-1", "seed": 4, "method": "inpainthuman"}
-    ledger = {"events": list(events), "stages": {k: {"seconds": v} for k, v in (stages or {}).items()}}
-    return RunResult(Path("x"), {"identity": identity, "ledger": ledger}, {})
+def run(*events):
+    ledger = LedgerState({}, 0.0, 0.0, events)
+    return RunResult(Path("x"), replace(record(identity("a", "m"), about()), ledger=ledger), {})
 
 
 def test_means_over_runs_and_only_the_last_event_of_a_resumed_one():

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 
+from ihbench.clock.events import Event
 from ihbench.clock.ledger import Ledger
 from ihbench.document.markdown import write as markdown
 from ihbench.files.atomic import read_json
+from ihbench.files.shape import from_json
 from ihbench.record.results import RunResult, read_result
+from ihbench.record.schema import LedgerState, Stage
 from ihbench.reports.general.ledger_table import TOLERANCE, account, ledger_section
 from tests.reports.made_up_runs import made_up
+
+
+def with_ledger(run: RunResult, books: LedgerState | None) -> RunResult:
+    return replace(run, record=replace(run.record, ledger=books))
 
 
 def table(runs):
@@ -58,12 +66,13 @@ def test_the_records_own_time_stamps_are_a_second_clock(tmp_path):
 @pytest.mark.parametrize("how", ["redone", "shared", "entered"])
 def test_there_is_no_second_clock_for_a_run_that_went_on_after_a_kill_or_borrowed_seconds(tmp_path, how):
     run = made_up(tmp_path, stamped=4000)
-    if how == "redone":
-        run.record["ledger"]["stages"]["redone"] = {"seconds": 0.0}
-    elif how == "shared":
-        run.record["ledger"]["events"].append({"kind": "shared", "data": {}})
+    books = run.record.ledger
+    if how == "shared":
+        books = replace(books, events=(Event("shared"),))
     else:
-        run.record["ledger"]["stages"]["load"]["entered"] = 2
+        again = {"redone": Stage(0.0)} if how == "redone" else {"load": Stage(1.0, entered=2)}
+        books = replace(books, stages={**books.stages, **again})
+    run = with_ledger(run, books)
     assert math.isnan(account(run).stamped)
     assert "disagree" not in markdown(ledger_section([run]))
 
@@ -75,13 +84,11 @@ def test_what_came_before_the_record_counts_on_both_sides(tmp_path):
 
 
 def test_a_run_without_a_ledger_has_no_row(tmp_path):
-    run = made_up(tmp_path)
-    run.record["ledger"] = None
-    assert ledger_section([run]) == []
+    assert ledger_section([with_ledger(made_up(tmp_path), None)]) == []
 
 
 def test_many_configurations_get_several_tables(tmp_path):
-    runs = [made_up(tmp_path, changed=(f"steps={k}",)) for k in range(9)]
+    runs = [made_up(tmp_path, changed={"steps": k}) for k in range(9)]
     assert markdown(ledger_section(runs)).count("| stage |") == 3
 
 
@@ -106,7 +113,7 @@ def test_books_of_a_ledger_with_every_kind_of_interruption_add_up(tmp_path):
             ledger.save_state("s", {}, {})
     now[0] += 0.2
     run = made_up(tmp_path)
-    found = account(RunResult(run.folder, run.record | {"ledger": ledger.state()}, run.rows))
+    found = account(with_ledger(run, from_json(ledger.state(), LedgerState)))
     assert found.wall == pytest.approx(5 + now[0])
     assert found.unnamed == pytest.approx(0.2)
     assert found.adds_up == (TOLERANCE * found.wall >= 0.2)

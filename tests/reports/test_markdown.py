@@ -2,13 +2,17 @@
 
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from ihbench.metrics import Mean
+from ihbench.clock.machine import Machine
 from ihbench.record.results import RunResult
+from ihbench.record.schema import PredictionFiles
 from ihbench.reports.general.report import MARKDOWN as write
+from ihbench.scene.plan import Omission
+from tests.reports.fake_runs import about, identity, mean, record
 
 PSNR, SSIM = "psnr/pooled/range1/{}/v1", "ssim/gauss11-1.5/range1/{}/v1"
 REGIONS = ("full", "body", "hidden")
@@ -16,37 +20,21 @@ REGIONS = ("full", "body", "hidden")
 
 def run(scene="a", method="ours", seed=0, psnr=20.0, ssim=0.5, truth=True, **changes):
     """A finished run whose every region has the same PSNR and SSIM."""
-    means = {}
+    means, perfect = {}, {}
     for region in REGIONS:
-        for identity, value in ((PSNR.format(region), psnr), (SSIM.format(region), ssim)):
-            means[identity] = Mean(value, identity, "nothing is hidden" if math.isnan(value) else "", n=4)
-    perfect = {i: Mean(math.inf if i.startswith("psnr") else 1.0, i, "", n=4) for i in means}
-    record = {
-        "status": changes.pop("status", "done"),
-        "reason": changes.pop("reason", ""),
-        "identity": {
-            "protocol": changes.pop("protocol", "p@1"),
-            "protocol_digest": changes.pop("digest", "abc"),
-            "profile": changes.pop("profile", "quick"),
-            "scene": scene,
-            "method": method,
-            "seed": seed,
-            "code": changes.pop("code", "1+old"),
-        },
-        "about": {
-            "standin": changes.pop("standin", "stand-in v1 seed 0"),
-            "variant": changes.pop("variant", "original/new_params"),
-            "headline": "body",
-            "changed": changes.pop("changed", []),
-            "left_out": changes.pop("left_out", []),
-            "fit_seconds": changes.pop("fit_seconds", 10.0),
-            "total_seconds": 20.0,
-            "peak_mb": changes.pop("peak_mb", 100.0),
-        },
+        for name, value, best in ((PSNR, psnr, math.inf), (SSIM, ssim, 1.0)):
+            means |= mean(name.format(region), value, "nothing is hidden" if math.isnan(value) else "")
+            perfect |= mean(name.format(region), best)
+    who = {name: changes.pop(name) for name in ("profile",) if name in changes}
+    who |= {
+        "protocol": changes.pop("protocol", "p@1"),
+        "protocol_digest": changes.pop("digest", "abc"),
+        "code": changes.pop("code", "1+old"),
     }
-    assert not changes
+    status, reason = changes.pop("status", "done"), changes.pop("reason", "")
+    told = record(identity(scene, method, seed=seed, **who), about(**changes), status, reason)
     rows = {method: means} | ({"truth": perfect} if truth else {})
-    return RunResult(Path("runs") / scene, record, rows if record["status"] == "done" else {})
+    return RunResult(Path("runs") / scene, told, rows if status == "done" else {})
 
 
 def titles(text):
@@ -92,7 +80,7 @@ def test_runs_of_one_protocol_share_a_table_whatever_their_order():
 
 def test_stand_ins_are_named_as_such_and_real_data_too():
     assert "Data: **stand-in v1 seed 0**: made by the bench, not real data." in write([run()])
-    assert "Data: real data (original/new_params)." in write([run(standin="")])
+    assert "Data: real data (original)." in write([run(standin="")])
 
 
 # ---------------------------------------------------------------------------------------- what a cell means
@@ -106,7 +94,7 @@ def test_every_scene_counts_once_however_many_seeds_it_has():
 
 
 def test_other_switches_make_another_row():
-    text = write([run(psnr=10.0), run(psnr=30.0, changed=["steps=5"])])
+    text = write([run(psnr=10.0), run(psnr=30.0, changed={"steps": 5})])
     assert row(text, "ours")["full"] == "10.00"
     assert row(text, "ours (steps=5)")["full"] == "30.00"
 
@@ -185,23 +173,23 @@ def test_a_run_that_is_not_done_is_named_with_its_reason_and_never_averaged():
 
 def test_views_that_a_mean_does_not_run_over_are_counted():
     result = run()
-    for identity in (PSNR.format("full"), SSIM.format("full")):
-        result.rows["ours"][identity] = Mean(20.0, identity, "region is empty", n=3, absent_count=1)
-    result.rows["ours"][PSNR.format("body")] = Mean(20.0, PSNR.format("body"), "", n=2, infinite=2)
+    for name in (PSNR, SSIM):
+        result.rows["ours"].update(mean(name.format("full"), 20.0, "region is empty", n=3, absent_count=1))
+    result.rows["ours"].update(mean(PSNR.format("body"), 20.0, n=2, infinite=2))
     text = write([result])
     assert text.count("- full of a (PSNR, SSIM): 1 of 4 absent: region is empty") == 1
     assert "- body of a (PSNR): 2 of 4 without any error (inf) left out" in text
 
 
 def test_what_was_left_out_is_said_once():
-    left_out = [{"field": "levels", "value": [16], "reason": "too fine"}]
+    left_out = (Omission("levels", [16], "too fine"),)
     text = write([run("a", left_out=left_out), run("b", left_out=left_out)])
     assert text.count("- left out, ours on a, b: levels → [16]: too fine") == 1
 
 
 def test_words_from_elsewhere_cannot_break_the_table():
     odd = run("b", status="failed", reason="no\n| such | thing <script>")
-    text = write([run(method="a|b", changed=["path=x|y\nz"]), odd])
+    text = write([run(method="a|b", changed={"path": "x|y\nz"}), odd])
     rows = tables(text)["PSNR ↑ (dB)"]
     assert [cells["method"] for cells in rows] == [r"a\|b (path=x\|y z)", "*truth*"]
     assert r"failed (no \| such \| thing &lt;script>)." in text
@@ -240,8 +228,8 @@ def test_a_preset_scored_later_has_a_table_of_its_own():
     legacy = "psnr/gauhuman-channels/range1/full/v1"
     result = run()
     result.presets["gauhuman"] = {
-        "ours": {legacy: Mean(31.5, legacy, "", n=4)},
-        "truth": {legacy: Mean(math.inf, legacy, "", n=4)},
+        "ours": mean(legacy, 31.5),
+        "truth": mean(legacy, math.inf),
     }
     text = write([result], ["gauhuman"])
     assert row(text, "ours", "preset gauhuman")["PSNR↑ full"] == "31.50"
@@ -250,14 +238,11 @@ def test_a_preset_scored_later_has_a_table_of_its_own():
 
 
 def test_predictions_are_labelled_and_have_no_fit_time():
-    result = run(fit_seconds=None)
-    result.record["about"]["provenance"] = "predictions"
+    result = run(fit_seconds=None, predictions=PredictionFiles((), (), ()))
     assert row(write([result]), "ours (predictions)")["fit s"] == "—"
 
 
 def test_seconds_of_two_machines_have_no_mean_in_the_main_table():
-    a, b = run(), run(seed=1)
-    for made, cpu in ((a, "fast"), (b, "slow")):
-        made.record["machine"] = {"cpu": cpu, "cores_usable": 4}
-    cells = row(write([a, b]), "ours")
+    made = [(run(seed=seed), Machine(cpu=cpu, cores_usable=4)) for seed, cpu in enumerate(("fast", "slow"))]
+    cells = row(write([replace(r, record=replace(r.record, machine=machine)) for r, machine in made]), "ours")
     assert (cells["fit s"], cells["total s"]) == ("—", "—")

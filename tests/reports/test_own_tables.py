@@ -12,13 +12,14 @@ from ihbench.document.document import write, write_fragment
 from ihbench.document.short_names import split_label, with_short_names
 from ihbench.errors import BadInput
 from ihbench.record.row_choice import Choice
+from ihbench.record.schema import PredictionFiles
 from ihbench.reports.general.report import HTML, LATEX, MARKDOWN
 from ihbench.reports.lint.metric_names import head_metric
 from ihbench.reports.lint.table_files import read_tables
 from ihbench.reports.lint.table_lint import lint
 from ihbench.reports.paper.paper_numbers import paper_table
 from ihbench.reports.paper.paper_table import build_frame
-from tests.reports.fake_runs import SUBJECTS, fake_run
+from tests.reports.fake_runs import SUBJECTS, fake_run, with_about
 from tests.reports.made_up_runs import FLIP, PSNR, made_up, sweep
 from tests.reports.test_ablation import rung, told
 from tests.reports.test_table_formats import structure
@@ -44,7 +45,7 @@ def random_runs(seed):
     rng = random.Random(seed)
     found = []
     for protocol in ("zju_occ@1", "people_snapshot_occ@1"):
-        for method, changed in (("ours", []), ("ours", ["levels=(64, 128)", "inpaint.on=False"]), ("theirs", [])):
+        for method, changed in (("ours", {}), ("ours", {"levels": (64, 128), "inpaint.on": False}), ("theirs", {})):
             base, spread = rng.choice((20.0, 20.004, 27.5)), rng.choice((0.0, 0.01, 1.0))
             for scene in SUBJECTS:
                 psnr, ssim = base + rng.gauss(0, spread), min(0.999, 0.9 + rng.gauss(0, spread / 100))
@@ -63,7 +64,7 @@ def random_runs(seed):
 def test_the_general_report_passes(tmp_path, scenes, psnr):
     runs = sweep(tmp_path / "runs", scenes, (0, 1))
     runs += [made_up(tmp_path / "more", s, "third", psnr=psnr, of=55, views=6) for s in scenes]
-    many = [made_up(tmp_path / "more", s, "long", changed=[f"a.b{k}={k}" for k in range(12)]) for s in scenes]
+    many = [made_up(tmp_path / "more", s, "long", changed={f"a.b{k}": k for k in range(12)}) for s in scenes]
     for report in (LATEX, MARKDOWN):
         for fragment in (False, True):
             text = report([*runs, *many], fragment=fragment)
@@ -115,7 +116,7 @@ def test_a_threshold_is_no_metric(head, metric):
 def test_fragments_and_documents_are_well_formed(tmp_path, seed):
     runs = random_runs(seed)
     frame = build_frame(TABLE1, runs, choice=Choice(regions=("body", "hidden")))
-    own = [*sweep(tmp_path), made_up(tmp_path, "a", "x_y & z", changed=("p%=1", "q=$2"))]
+    own = [*sweep(tmp_path), made_up(tmp_path, "a", "x_y & z", changed={"p%": 1, "q": "$2"})]
     begin, end = "\\begin{document}\n", "\n\\end{document}\n"
     for text in (LATEX(own), write(frame.blocks, "tex")):
         assert structure(text) == []
@@ -181,7 +182,7 @@ def test_rows_are_short_in_latex_and_the_switches_stand_below(tmp_path):
 
 
 def test_in_markdown_and_on_pages_only_long_names_are_cut(tmp_path):
-    long = made_up(tmp_path, changed=[f"switch{k}={k}" for k in range(8)])
+    long = made_up(tmp_path, changed={f"switch{k}": k for k in range(8)})
     for report in (MARKDOWN, HTML):
         text = report([*sweep(tmp_path), long])
         assert "ours (steps=50)" in text
@@ -215,7 +216,7 @@ def test_rows_metrics_regions_and_names_are_chosen(tmp_path, kind):
     assert not re.search("FLIP|body", re.sub("</?tbody>", "", text))
     whole = WRITERS[kind](choice.applied(runs))
     assert not re.search(r"FLIP|ours", re.sub(r"src=\S+", "", whole))
-    others = [run for run in runs if run.record["about"]["changed"]]
+    others = [run for run in runs if run.about.changed]
     every = WRITERS[kind](
         Choice(("ours",)).applied([*others, runs[-1]]), fragment=True
     )  # a method is all of its rows
@@ -268,9 +269,9 @@ def test_measured_blocks_are_there_for_every_region():
 
 
 def test_a_run_with_a_name_of_its_own_keeps_the_mark_of_missing_views(tmp_path):
-    run = made_up(tmp_path)
-    run.record["about"]["predictions"] = {"missing": ["x"], "views": 4}
-    named = Choice(names=("ours=Mine",)).applied([run])
+    files = PredictionFiles(missing=("x",), surplus=(), notes=(), views=4)
+    run = with_about(made_up(tmp_path), predictions=files)
+    named = Choice(names=("ours (predictions)=Mine",)).applied([run])
     text = MARKDOWN(named)
     assert "| Mine (only 3 of 4 views) |" in text
 
@@ -278,6 +279,6 @@ def test_a_run_with_a_name_of_its_own_keeps_the_mark_of_missing_views(tmp_path):
 def test_a_curve_is_chosen_like_the_table(tmp_path):
     run = made_up(tmp_path)
     (chosen,) = Choice(metrics=("flip",), regions=("hidden",)).applied([run])
-    assert {i for point in chosen.curve for i in point["scores"]} == {FLIP.format("hidden")}
-    assert PSNR.format("hidden") in run.curve[0]["scores"]
-    assert replace(chosen).record["about"]["headline"] == "hidden"
+    assert {str(i) for point in chosen.curve for i in point.scores} == {FLIP.format("hidden")}
+    assert PSNR.format("hidden") in map(str, run.curve[0].scores)
+    assert replace(chosen).headline == "hidden"

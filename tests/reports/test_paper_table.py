@@ -8,6 +8,7 @@ import pytest
 
 from ihbench.reports.paper.paper_numbers import paper_table
 from ihbench.reports.paper.paper_table import build_frame
+from ihbench.scene.plan import Omission
 from tests.reports.fake_runs import LPIPS, PSNR, SUBJECTS, fake_run
 
 TABLE1, TABLE2 = paper_table("table1"), paper_table("table2")
@@ -171,8 +172,7 @@ def test_runs_that_are_not_done_are_told_with_the_cell():
 
 
 def test_a_run_that_failed_before_it_said_anything_is_told_of_below_the_rows():
-    early = fake_run("b", "early", status="failed", reason="no images")
-    del early.record["about"]["changed"]
+    early = fake_run("b", "early", status="failed", reason="no images", said={"changed": None})
     found = block(build_frame(TABLE1, [fake_run("a"), early]), "stand-in")
     assert [label.name for label in found.labels] == ["ours", "truth"]
     assert "Not done: early on b, seed 0: failed (no images)." in found.notes
@@ -224,5 +224,5 @@ def test_components_are_told_from_the_switches():
 
 
 def test_what_the_plan_left_out_is_not_there():
-    left_out = [{"field": "one_fit", "value": True, "reason": "nothing hidden"}]
+    left_out = (Omission("one_fit", True, "nothing hidden"),)
     assert ablated(switches(), left_out=left_out) == {"MS Maps": "✓", "TI": "", "SG": "", "inpainting": ""}

@@ -10,6 +10,7 @@ from dataclasses import replace
 import pytest
 
 from ihbench.document.markdown import write as markdown
+from ihbench.metrics import Identity
 from ihbench.metrics.statistics import Interval
 from ihbench.record.quality_time import Target
 from ihbench.reports.general.configurations import configurations, sweeps
@@ -17,9 +18,10 @@ from ihbench.reports.general.figures import ROOM, _shown, draw
 from ihbench.reports.general.report import HTML, LATEX
 from ihbench.reports.general.report import MARKDOWN as write
 from ihbench.reports.general.run_time import across_sizes_section, run_time_section, work_points
+from tests.reports.fake_runs import with_about
 from tests.reports.made_up_runs import FLIP, PSNR, made_up, sweep
 
-IDENTITIES = [PSNR.format("body"), FLIP.format("body")]
+IDENTITIES = [Identity.parse(PSNR.format("body")), Identity.parse(FLIP.format("body"))]
 
 
 def section(runs, *targets):
@@ -106,15 +108,14 @@ def test_unstable_is_said_when_repeats_or_the_load_say_so_and_only_then(tmp_path
     apart = [made_up(tmp_path, seed=k, fit=f) for k, f in enumerate((40, 60))]
     assert "unstable seconds: repeats 40% of their median apart: ours" in section(apart)
     for when in ("load_average", "load_average_end"):  # also what came while it ran
-        busy = [made_up(tmp_path, machine={when: [9.0, 1.0, 1.0]})]
+        busy = [made_up(tmp_path, machine={when: (9.0, 1.0, 1.0)})]
         assert "unstable seconds: 1 of 1 runs on a busy machine (load up to 2.2 per core): ours" in section(busy)
-    pinned = [made_up(tmp_path, machine={"load_average_end": [4.0, 1.0, 1.0], "cores_usable": 1})]
+    pinned = [made_up(tmp_path, machine={"load_average_end": (4.0, 1.0, 1.0), "cores_usable": 1})]
     assert "unstable" not in section(pinned)  # the load is the whole machine's
 
 
 def test_runs_without_a_fit_time_have_no_section(tmp_path):
-    scored = made_up(tmp_path)
-    scored.record["about"]["fit_seconds"] = None
+    scored = with_about(made_up(tmp_path), fit_seconds=None)
     assert section([scored]) == "\n"
 
 
@@ -249,11 +250,11 @@ def test_a_sweep_is_every_chain_of_rows_that_differ_in_one_number(tmp_path):
 def test_switches_without_order_make_no_sweep_and_lists_are_ordered_by_length(tmp_path):
     runs = [
         made_up(tmp_path, config={"levels": [64, 128], "on": True}),
-        made_up(tmp_path, config={"levels": [64], "on": True}, changed=("levels=(64,)",)),
-        made_up(tmp_path, config={"levels": [64, 128], "on": False}, changed=("on=False",)),
+        made_up(tmp_path, config={"levels": [64], "on": True}, changed={"levels": [64]}),
+        made_up(tmp_path, config={"levels": [64, 128], "on": False}, changed={"on": False}),
     ]
     (found,) = sweeps(configurations(runs))
-    assert (found.axis, [value for value, _ in found.members]) == ("levels", [[64], [64, 128]])
+    assert (found.axis, [value for value, _ in found.members]) == ("levels", [(64,), (64, 128)])
 
 
 def test_the_csv_holds_what_the_figure_shows(tmp_path):
@@ -263,7 +264,7 @@ def test_the_csv_holds_what_the_figure_shows(tmp_path):
     for png in drawn:
         assert png.with_suffix(".svg").read_text().startswith("<?xml")
     rows = list(csv.DictReader(drawn[0].with_suffix(".csv").open()))
-    points = work_points(configurations(runs), PSNR.format("body"), ["a", "b"])
+    points = work_points(configurations(runs), IDENTITIES[0], ["a", "b"])
     shown = {row["configuration"]: row for row in rows if row["identity"] == PSNR.format("body")}
     assert len(points) == len(shown) == 6
     for p in points:

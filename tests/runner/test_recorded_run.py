@@ -11,9 +11,12 @@ from ihbench.clock import machine
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.files import atomic
+from ihbench.metrics import Identity
+from ihbench.record.schema import ScoreLine
 from ihbench.record.store import RunFolder
 from ihbench.runner.recorded_run import RecordedRun, recorded
 from tests.record.test_store import IDENTITY
+from tests.reports.fake_runs import about
 
 
 class OneStage(RecordedRun):
@@ -37,15 +40,15 @@ def test_the_peak_is_that_of_the_process_that_held_most(tmp_path, monkeypatch):
     run = OneStage(again, Progress.silent())
     run.ledger.book("score", 1.0)
     run.describe()
-    assert again.record["about"]["peak_mb"] == 3000.0
+    assert again.about.peak_mb == 3000.0
 
 
 def test_a_run_that_ends_well_says_so(tmp_path):
     folder = RunFolder.create(tmp_path, IDENTITY)
     OneStage(folder, Progress.silent()).guarded()
-    record = RunFolder.open(folder.path).record
-    assert record["status"] == "done"
-    assert record["about"]["peak_mb"] > 10
+    run = RunFolder.open(folder.path)
+    assert run.status == "done"
+    assert run.about.peak_mb > 10
 
 
 class Fails(RecordedRun):
@@ -56,9 +59,9 @@ class Fails(RecordedRun):
 def test_a_method_that_exits_fails_and_takes_nothing_along(tmp_path):
     folder = RunFolder.create(tmp_path, IDENTITY)
     Fails(folder, Progress.silent()).guarded()
-    record = RunFolder.open(folder.path).record
-    assert record["status"] == "failed"
-    assert record["reason"] == "SystemExit: this method prefers to leave (see traceback.txt)"
+    run = RunFolder.open(folder.path)
+    assert run.status == "failed"
+    assert run.reason == "SystemExit: this method prefers to leave (see traceback.txt)"
 
 
 def test_a_record_that_cannot_be_written_is_said_and_the_first_reason_counts(tmp_path, monkeypatch):
@@ -75,11 +78,8 @@ def test_a_record_that_cannot_be_written_is_said_and_the_first_reason_counts(tmp
 
 
 def test_a_finished_run_is_found_where_nothing_may_be_written(tmp_path, monkeypatch):
-    about = {"standin": "", "variant": "", "headline": "body", "changed": [], "left_out": []}
-    about |= {"fit_seconds": 1.0, "total_seconds": 1.0, "peak_mb": 1.0}
-    folder = RunFolder.create(tmp_path, IDENTITY, about)
-    scores = {"psnr/pooled/range1/full/v1": 30.0}
-    folder.write_scores([{"row": "inpainthuman", "camera": "1", "frame": 0, "scores": scores, "absent": {}}])
+    folder = RunFolder.create(tmp_path, IDENTITY, about())
+    folder.write_scores([ScoreLine("inpainthuman", "1", 0, {Identity.parse("psnr/pooled/range1/full/v1"): 30.0}, {})])
     folder.set_status("done")
 
     def read_only(*_, **__):

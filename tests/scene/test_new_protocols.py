@@ -13,6 +13,7 @@ from ihbench.clock.progress import Progress
 from ihbench.datasets.plain import plain_scene
 from ihbench.errors import BadInput
 from ihbench.files.images import write_png
+from ihbench.metrics import Identity
 from ihbench.record.results import read_result
 from ihbench.scene.data_source import body_file, locate
 from ihbench.scene.protocol import load_protocol
@@ -61,10 +62,10 @@ def test_a_video_of_ones_own_runs_with_its_own_body(own_video, tmp_path, mannequ
     assert status == 0, capsys.readouterr().err
     (folder,) = (p.parent for p in tmp_path.glob("*/run.json"))
     result = read_result(folder)
-    assert result.record["about"]["body"] == "own"
-    assert result.record["about"]["standin"] == ""
-    assert result.record["identity"]["protocol"] == "custom_occ@1+occlusion=central-band,fraction=0.3"
-    assert 0.3 <= result.record["about"]["hidden_share"] < 0.36
+    assert result.about.body == "own"
+    assert result.about.standin == ""
+    assert result.identity.protocol == "custom_occ@1+occlusion=central-band,fraction=0.3"
+    assert 0.3 <= result.about.hidden_share < 0.36
     report = bench("report", folder, "--preset", "gauhuman", "--data", own_video)
     assert report.status == 0, report.err
     assert "real data (plain)" in report.out
@@ -144,7 +145,7 @@ def test_the_released_score_stands_beside_the_held_out_one(tmp_path, bench, mann
     (folder,) = (p.parent for p in (tmp_path / "runs").glob("*/run.json"))
     rows = read_result(folder).rows
     assert {"mannequin", "mannequin [train = test]"} <= set(rows)
-    identity = "psnr/pooled/range1/body/v1"
+    identity = Identity.parse("psnr/pooled/range1/body/v1")
     assert rows["mannequin"][identity].value != rows["mannequin [train = test]"][identity].value
     assert "| mannequin [train = test] |" in outcome.out
     frames = {(line["row"], line["frame"] % 2) for line in map(json.loads, (folder / "scores.jsonl").open())}

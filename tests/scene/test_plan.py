@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from ihbench.body import texel_table
 from ihbench.body.pose import BodyPose
 from ihbench.config_fields import flat, with_fields
+from ihbench.files.shape import as_json
 from ihbench.methods.inpainthuman import config as method_config
 from ihbench.methods.inpainthuman.config import (
     LEAST_TEXELS,
@@ -273,7 +274,7 @@ def a_run(
         "status": status,
         "reason": "",
         "digest": own.digest,
-        "identity": vars(own),
+        "identity": as_json(own),
         "about": {"total_seconds": seconds, "changed": [], "left_out": [], **about},
         "created": "2025-01-01T00:00:00+00:00",
         "machine": {"cpu": cpu},

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -25,7 +25,7 @@ from ihbench.methods.inpainthuman.stages.stage1 import Stage1
 from ihbench.methods.inpainthuman.stages.stage2 import STATE as PAINTED_STATE
 from ihbench.methods.inpainthuman.stages.stage2 import Stage2
 from ihbench.methods.inpainthuman.stages.stage3 import Stage3
-from ihbench.metrics import mean_over_frames
+from ihbench.metrics import Identity, mean_over_frames
 from ihbench.record.reopen import reopen_scene
 from ihbench.record.results import read_result
 from ihbench.scene.contracts import MaskState, TrainView
@@ -42,7 +42,7 @@ class CeilingRow:
     name: str
     truth: float | None  # share of the way from the painted colours to the true ones; None for stage 1 alone
     painted_psnr: float  # dB, over painted person pixels; NaN for stage 1 alone
-    scores: dict[str, float]  # identity -> mean over the scene's own test views
+    scores: Mapping[Identity, float]  # identity -> mean over the scene's own test views
 
 
 def ceiling(
@@ -63,7 +63,7 @@ def ceiling(
     scene, model = reopen_scene(folder, data, body)
     whole = uncovered(scene).train
     fitted = GaussianAvatar.load(folder / "avatar", model)
-    seed = int(result.identity["seed"])
+    seed = result.seed
     scorer = Scorer.build(scene)
     rows = []
     with TemporaryDirectory() as copy:
@@ -80,7 +80,7 @@ def ceiling(
         taken = [view for view in painted if view.index < len(whole)]
         if not taken:
             raise BadInput(f"{folder}: painted no training view")
-        own = {identity: mean.value for identity, mean in result.rows[result.method].items()}
+        own = {identity: mean.value for identity, mean in result.own.items()}
         rows.append(CeilingRow("as painted", 0.0, painted_psnr(taken, whole), own))
         turntable = painted[len(taken) :]  # their truth is not to be had
         for share in shares:
@@ -123,9 +123,9 @@ def _lent(folder: Path, copy: Path) -> Ledger:
     return Ledger(copy)
 
 
-def _scores(avatar: GaussianAvatar, scorer: Scorer, scene: OccludedScene) -> dict[str, float]:
+def _scores(avatar: GaussianAvatar, scorer: Scorer, scene: OccludedScene) -> dict[Identity, float]:
     background = scene.protocol.image.background
     own = [k for k, key in enumerate(scene.test_keys) if not key.group]
     rows = {"now": lambda loaded: avatar.render(loaded.view.camera, loaded.view.body_pose, background)[0]}
     views = [scored.scores["now"].scores for scored in scorer.scored(rows, own)]
-    return {identity: mean_over_frames([view[identity] for view in views]).value for identity in views[0]}
+    return {Identity.parse(i): mean_over_frames([view[i] for view in views]).value for i in views[0]}

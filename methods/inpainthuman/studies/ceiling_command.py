@@ -19,6 +19,7 @@ from ihbench.methods.inpainthuman.spec import SPEC
 
 if TYPE_CHECKING:
     from ihbench.methods.inpainthuman.studies.ceiling import CeilingRow
+    from ihbench.record.results import RunResult
 
 REGIONS = ("hidden", "visible", "never_seen")
 
@@ -71,7 +72,7 @@ def _ceiling(chosen: CeilingOptions) -> int:
         found.append((result.scene, rows))
         for row in rows:
             told = ", ".join(f"{region} {_mean(row, region):.2f}" for region in REGIONS)
-            progress.say(f"{result.scene} seed {result.identity['seed']}, {row.name}: {told}")
+            progress.say(f"{result.scene} seed {result.seed}, {row.name}: {told}")
         runs = [_numbers(r, its_rows) for r, (_, its_rows) in zip(results, found, strict=False)]
         title = _title(results[: len(found)])
         numbers = {"title": title, "runs": runs}
@@ -83,9 +84,9 @@ def _ceiling(chosen: CeilingOptions) -> int:
     return 0
 
 
-def _title(results: Sequence[Any]) -> str:
+def _title(results: Sequence[RunResult]) -> str:
     scenes = len({result.scene for result in results})
-    return f"{results[0].identity['protocol']}, {len(results)} runs of {scenes} scenes, {results[0].data}"
+    return f"{results[0].identity.protocol}, {len(results)} runs of {scenes} scenes, {results[0].data}"
 
 
 def table(found: Sequence[tuple[str, Sequence[CeilingRow]]], title: str) -> list[Block]:
@@ -109,11 +110,8 @@ def table(found: Sequence[tuple[str, Sequence[CeilingRow]]], title: str) -> list
 
 def _mean(row: CeilingRow, region: str) -> float:
     """PSNR of the first preset in a region; NaN where the protocol or the scene has none."""
-    from ihbench.metrics import Identity
-
     for identity, value in row.scores.items():
-        parsed = Identity.parse(identity)
-        if parsed.metric == "psnr" and parsed.region == region:
+        if identity.metric == "psnr" and identity.region == region:
             return value
     return math.nan
 
@@ -149,20 +147,20 @@ def _decibels(value: float) -> str:
     return METRICS["psnr"].text(value)
 
 
-def _numbers(result: Any, rows: Sequence[CeilingRow]) -> dict[str, Any]:
+def _numbers(result: RunResult, rows: Sequence[CeilingRow]) -> dict[str, Any]:
     def plain(value: float) -> float | str | None:
         return None if math.isnan(value) else "inf" if math.isinf(value) else value
 
     return {
         "scene": result.scene,
-        "seed": result.identity["seed"],
-        "run": result.record["digest"],
+        "seed": result.seed,
+        "run": result.record.digest,
         "rows": [
             {
                 "paintings": row.name,
                 "truth": row.truth,
                 "painted_psnr": plain(row.painted_psnr),
-                "scores": {identity: plain(value) for identity, value in row.scores.items()},
+                "scores": {str(identity): plain(value) for identity, value in row.scores.items()},
             }
             for row in rows
         ],

@@ -1,26 +1,30 @@
-"""Whether a value that was read from a file has the shape that a type says.
+"""Frozen dataclasses from JSON and back, and whether a value that a file holds has the shape that a type says.
 
-Types are what annotations are made of: `str`, `int`, `float`, `bool`, `None`, unions, `Literal`, `list[...]`,
-`dict[str, ...]`, `TypedDict` (whose further keys may hold any JSON), `Any` for JSON of any kind, and `Annotated` with
-a `Within` or a `Matches`. A whole number is a float too, and true is no number.
+Types are what annotations are made of: `str`, `int`, `float`, `bool`, `None`, unions, `Literal`, `tuple[X, ...]`,
+`Mapping[X, ...]`, dataclasses, classes that `parse` a text (metric identities), `Any` for JSON of any kind, and
+`Annotated` with a `Within` or a `Matches`. A whole number is a float too, and true is no number. A dataclass's fields
+without default must be there; its further keys may hold any JSON, and are kept where it has a field `more`.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import cache
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, NotRequired, Union, get_args, get_origin, get_type_hints, is_typeddict
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 LARGEST = 1e15  # of a number without bounds of its own: far from where sums overflow or doubles skip whole numbers
 WHOLE = 2**63 - 1  # the largest whole number that databases and arrays hold
 LONGEST = 100_000  # letters of a text
 DEEPEST = 40  # of values within values
 
+MORE = "more"  # the field of a dataclass for keys that it does not know
+
 Check = Callable[[Any], str]  # "" where the shape is right, else where and what is wrong
+Make = Callable[[Any], Any]
 
 
 @dataclass(frozen=True)
@@ -57,9 +61,29 @@ class Matches:
 
 
 def fault(value: Any, kind: Any) -> str:
-    """Where and how `value` differs from the type `kind`, such as ".events[3].kind is missing"; "" where it does
+    """Where and how `value` differs from the type `kind`, such as "events[3].kind is missing"; "" where it does
     not. Raises `TypeError` for a type that this module does not know."""
-    return _check(kind)(value)
+    return _check(kind)(value).lstrip(". ")
+
+
+def from_json(value: Any, kind: Any) -> Any:
+    """The value as the type `kind`. For a value without `fault`; what there is else is not looked at."""
+    return _maker(kind)(value)
+
+
+def as_json(value: Any) -> Any:
+    """The inverse of `from_json`. None is left out where it is a field's default."""
+    if isinstance(value, str | int | float | None):
+        return value
+    if isinstance(value, Mapping):
+        return {str(key): as_json(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [as_json(item) for item in value]
+    if is_dataclass(value) and not isinstance(value, type):
+        known = {field: getattr(value, field.name) for field in fields(value) if field.name != MORE}
+        made = {f.name: as_json(item) for f, item in known.items() if item is not None or f.default is not None}
+        return made | as_json(getattr(value, MORE, {}))
+    return value
 
 
 @cache
@@ -67,7 +91,9 @@ def _check(kind: Any) -> Check:
     origin, inner = get_origin(kind), get_args(kind)
     if kind is Any:
         return lambda value: _any(value, DEEPEST)
-    if is_typeddict(kind):
+    if hasattr(kind, "parse"):
+        return lambda value: _text(value) or _parsed(kind, value)
+    if is_dataclass(kind):
         return _fields(kind)
     if origin is Annotated:
         return _annotated(inner[0], inner[1:])
@@ -75,9 +101,9 @@ def _check(kind: Any) -> Check:
         return lambda value: "" if type(value) is str and value in inner else f"is {_told(value)}, expected {inner}"
     if origin in (Union, UnionType):
         return _either(inner)
-    if origin is list:
+    if origin is tuple:
         return _items(_check(inner[0]))
-    if origin is dict:
+    if origin in (dict, Mapping):
         return _mapping(_check(inner[0]), _check(inner[1]))
     return _plain(kind)
 
@@ -163,12 +189,8 @@ def _mapping(of_key: Check, inner: Check) -> Check:
 
 
 def _fields(kind: Any) -> Check:
-    hints = get_type_hints(kind, include_extras=True)
-    optional = {name for name, hint in hints.items() if get_origin(hint) is NotRequired}
-    checks = {
-        name: _check(get_args(hint)[0] if name in optional else hint) for name, hint in hints.items()
-    }  # fmt: skip
-    required = [name for name in hints if name not in optional]
+    checks = {name: _check(hint) for name, hint in _hints(kind).items()}
+    required = [f.name for f in fields(kind) if f.default is MISSING and f.default_factory is MISSING]
 
     def check(value: Any) -> str:
         if type(value) is not dict:
@@ -183,6 +205,55 @@ def _fields(kind: Any) -> Check:
         return ""
 
     return check
+
+
+def _parsed(kind: Any, value: str) -> str:
+    try:
+        kind.parse(value)
+    except ValueError as error:
+        return f"is {value[:80]!a}, {str(error).partition(', got')[0].partition(': ')[2]}"
+    return ""
+
+
+@cache
+def _hints(kind: Any) -> dict[str, Any]:
+    return {name: hint for name, hint in get_type_hints(kind, include_extras=True).items() if name != MORE}
+
+
+@cache
+def _maker(kind: Any) -> Make:
+    origin, inner = get_origin(kind), get_args(kind)
+    if hasattr(kind, "parse"):
+        return kind.parse
+    if is_dataclass(kind):
+        return _dataclass(kind)
+    if origin in (Union, UnionType):
+        (make,) = [_maker(option) for option in inner if option is not NoneType][:1]
+        return _same if make is _same else lambda value: None if value is None else make(value)
+    if origin is tuple:
+        item = _maker(inner[0])
+        return tuple if item is _same else lambda value: tuple(map(item, value))
+    if origin in (dict, Mapping):
+        key, item = map(_maker, inner)
+        return _same if key is item is _same else lambda value: {key(k): item(v) for k, v in value.items()}
+    return _same
+
+
+def _same(value: Any) -> Any:
+    return value
+
+
+def _dataclass(kind: Any) -> Make:
+    makers = {name: _maker(hint) for name, hint in _hints(kind).items()}
+    keeps = any(field.name == MORE for field in fields(kind))
+
+    def make(value: Mapping[str, Any]) -> Any:
+        known = {name: makers[name](item) for name, item in value.items() if name in makers}
+        if keeps and len(known) < len(value):
+            known[MORE] = {name: item for name, item in value.items() if name not in makers}
+        return kind(**known)
+
+    return make
 
 
 def _any(value: Any, room: int) -> str:
