@@ -1,4 +1,4 @@
-"""The tutorial page as a newcomer follows it: its files make a package that runs, continues and stands in the table."""
+"""The tutorial page as a newcomer follows it: its files make a package that runs, resumes, stands in the table."""
 
 import json
 import re
