@@ -50,6 +50,22 @@ def summary(samples: list[Sample]) -> Row:
     return row
 
 
+def row_of(
+    kernel: str,
+    case: str,
+    backend: str,
+    samples: list[Sample],
+    memory: float | None,  # MiB
+    error: float | None,
+    gradient_error: float | None = None,
+    **more: str,
+) -> Row:
+    """A row of the table."""
+    errors = {"value_error": error, "gradient_error": gradient_error}
+    of = {"kernel": kernel, "case": case, "backend": backend, **more}
+    return {**of, **summary(samples), "peak_mib": memory, **errors}
+
+
 def peak_mib(step: Callable[[], object]) -> float | None:
     """Memory that a step needs while it runs, in MiB; None where the system cannot say (not Linux with glibc)."""
     try:

@@ -6,7 +6,6 @@ LPIPS is the package it calls, in float64. Libraries that are not installed have
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 
 from ihbench.clock.threads import one_torch_thread, single_threaded_libraries
 from ihbench.errors import BadInput
-from ihbench.kernels.measuring import Row, interleave, peak_mib, summary
+from ihbench.kernels.measuring import Row, Sample, interleave, peak_mib, row_of, timed
 from ihbench.metrics.oracles.cases import Case, hashed, person_case
 from ihbench.metrics.oracles.libraries import as_torch, official_flip
 
@@ -34,6 +33,7 @@ TILED = "tiled"
 DTYPES = (np.uint8, np.float16, np.float32, np.float64)
 WHITE = (1.0, 1.0, 1.0)
 FIGURES = {"1/20": (0.55, 0.27), "1/10": (0.75, 0.4), "1/3": (1.0, 1.0)}  # share of the frame -> of height, width
+METRIC_SETS = {"psnr+ssim": ("psnr", "ssim"), "psnr+ssim+flip": ("psnr", "ssim", "flip")}
 FRAME_REGIONS = ("full", "box", "body", "visible", "hidden", "never_seen")
 
 Metric = Callable[..., float]  # of two images
@@ -44,22 +44,17 @@ def ssim_rows(repeats: int, size: int = SIZE) -> list[Row]:
     from ihbench.metrics.oracles.oracle import ssim_oracle
     from ihbench.metrics.ssim import ssim
 
-    others: dict[str, tuple[type, Metric, str]] = {"torch loss f32": (np.float32, _ssim_torch, "mirror")}
-    for package, name, metric, border in (
-        ("skimage", "scikit-image f64", _scikit_image, "cropped"),
-        ("torchmetrics", "torchmetrics f32", _torchmetrics, "reflect"),
-        ("kornia", "kornia f32", _kornia, "reflect"),
-    ):
-        if find_spec(package) is not None:
-            others[name] = (np.float64 if name.endswith("f64") else np.float32, metric, border)
-    oracles: dict[Any, float] = {}
+    others: dict[str, tuple[type, Metric, str]] = {
+        "torch loss f32": (np.float32, _ssim_torch, "mirror"),
+        "scikit-image f64": (np.float64, _scikit_image, "cropped"),
+    }
+    if find_spec("torchmetrics") is not None:
+        others["torchmetrics f32"] = (np.float32, _torchmetrics, "reflect")
+    others["kornia f32"] = (np.float32, _kornia, "reflect")
 
     def oracle(small: Case, border: str) -> float:
-        key = small.name, border
-        if key not in oracles:
-            options: dict[str, Any] = {"crop": 5} if border == "cropped" else {"border": border}
-            oracles[key] = ssim_oracle(small.pred, small.truth, **options)
-        return oracles[key]
+        options: dict[str, Any] = {"crop": 5} if border == "cropped" else {"border": border}
+        return ssim_oracle(small.pred, small.truth, **options)
 
     rows = []
     for case, make in (("every pixel", _noise_case), ("a person", person_case)):
@@ -107,7 +102,7 @@ def lpips_rows(repeats: int, size: int = SIZE, nets: Sequence[str] | None = None
                 region = "a person's crop" if "crop" in name else "whole frame"
                 error = abs(checks[name](small.pred, small.truth) - truths["crop" in name])
                 memory = peak_mib(lambda f=steps[name]: f(frame.pred, frame.truth))
-                rows.append(_row("lpips", f"{named}, {region}@{size}", name, timings[name], memory, error))
+                rows.append(row_of("lpips", f"{named}, {region}@{size}", name, timings[name], memory, error))
     return rows
 
 
@@ -169,8 +164,7 @@ def frame_rows(repeats: int, size: int = SIZE) -> list[Row]:
     rows = []
     for share, extent in FIGURES.items():
         frame, small = _framed_person(extent, size, size), _framed_person(extent, *ERROR_SIZE)
-        steps, presets = {}, {"psnr+ssim": headline_with(("psnr", "ssim"))}
-        presets["psnr+ssim+flip"] = headline_with(("psnr", "ssim", "flip"))
+        steps, presets = {}, {name: headline_with(metrics) for name, metrics in METRIC_SETS.items()}
         for name, preset in presets.items():
             score = lambda x, y, p=preset: evaluate(x, y, _six(frame), p)  # noqa: E731, B023
             steps[name] = partial(_timed, score, frame)
@@ -181,7 +175,7 @@ def frame_rows(repeats: int, size: int = SIZE) -> list[Row]:
             found = evaluate(small.pred, small.truth, _six(small), preset)
             error = max(abs(score.value - truth[i]) for i, score in found.items() if not np.isnan(score.value))
             memory = peak_mib(lambda p=preset, f=frame: evaluate(f.pred, f.truth, _six(f), p))
-            rows.append(_row("frame", f"6 regions, {share}@{size}", name, timings[name], memory, error))
+            rows.append(row_of("frame", f"6 regions, {share}@{size}", name, timings[name], memory, error))
     return rows
 
 
@@ -219,26 +213,12 @@ def _compared(
             frame, small = frames[dtype], make(*ERROR_SIZE, dtype)
             error = abs(metric(small.pred, small.truth) - oracle(small, which))
             memory = peak_mib(lambda f=metric, x=frame: f(x.pred, x.truth))
-            rows.append(_row(kernel, f"{case}@{size}", name, timings[name], memory, error))
+            rows.append(row_of(kernel, f"{case}@{size}", name, timings[name], memory, error))
     return rows
 
 
-def _timed(metric: Callable[[NDArray, NDArray], Any], frame: Case) -> tuple[float, None]:
-    start = time.perf_counter()
-    metric(frame.pred, frame.truth)
-    return (time.perf_counter() - start) * 1e3, None
-
-
-def _row(kernel: str, case: str, backend: str, samples: list, memory: float | None, error: float) -> Row:
-    return {
-        "kernel": kernel,
-        "case": case,
-        "backend": backend,
-        **summary(samples),
-        "peak_mib": memory,
-        "value_error": error,
-        "gradient_error": None,
-    }
+def _timed(metric: Callable[[NDArray, NDArray], Any], frame: Case) -> Sample:
+    return timed(partial(metric, frame.pred, frame.truth))
 
 
 def _short(dtype: type) -> str:

@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench.kernels.measuring import Row, interleave, peak_mib, summary, timed
+from ihbench.body import Body, load_body, position_map, texel_table
+from ihbench.body.pose import BodyPose
+from ihbench.kernels.measuring import Row, interleave, peak_mib, row_of, timed
 
 POSITION_CASES = (64, 128, 256)  # texels, side of the map
 TWIN_UP_TO = 32  # texels a side that the twin looks at; of a finer map every n-th
@@ -23,61 +25,43 @@ def position_map_rows(repeats: int, cases: Sequence[int] = POSITION_CASES) -> li
     both have; infinite where one has a texel inside a chart that the other lacks. The time of the twin is
     extrapolated from the texels that it looked at.
     """
-    from ihbench.body import load_body, position_map, texel_table
-    from ihbench.body.pose import BodyPose
-
     body = load_body()
     pose = BodyPose(np.random.default_rng(0).normal(0, 0.3, (24, 3)), np.zeros(10), np.zeros(3))
     vertices = body.pose(pose)
     rows = []
     for resolution in cases:
         step = max(1, resolution // TWIN_UP_TO)
-
-        def cached(resolution: int = resolution) -> tuple[NDArray, NDArray]:
-            return position_map(vertices, body, resolution)
-
-        def anew(resolution: int = resolution) -> NDArray:
-            texels = texel_table.__wrapped__(body, resolution)
-            return texels.interpolate(vertices, body.faces)
-
-        found, mask = cached()
+        steps: dict[str, Callable[[], Any]] = {
+            "cached table f32": partial(position_map, vertices, body, resolution),
+            "table anew f64": partial(_anew, vertices, body, resolution),
+        }
+        cached, mask = steps["cached table f32"]()
+        anew = np.zeros((resolution, resolution, 3))
+        anew.reshape(-1, 3)[texel_table(body, resolution).index] = steps["table anew f64"]()
         start = time.perf_counter()
         exact, inside = brute_force_map(vertices, body, resolution, step)
         twin_ms = (time.perf_counter() - start) * 1e3 * step**2
         common = mask[::step, ::step] & inside
         same = bool((mask[::step, ::step] == inside).all())
-        off = np.linalg.norm(found[::step, ::step][common] - exact[common], axis=-1).max(initial=0.0)
-        from_table = np.zeros((resolution**2, 3))
-        from_table[texel_table(body, resolution).index] = anew()
-        table_off = np.linalg.norm(
-            from_table.reshape(resolution, resolution, 3)[::step, ::step][common] - exact[common], axis=-1
-        ).max(initial=0.0)
-        steps: dict[str, Callable[[], Any]] = {"cached table f32": cached, "table anew f64": anew}
         timings = interleave({name: partial(timed, f) for name, f in steps.items()}, repeats)
         timings[TWIN] = [(twin_ms, None)]
-        errors = {
-            "cached table f32": float(off),
-            "table anew f64": float(table_off),
-            TWIN: 0.0,
-        }
-        for name, samples in timings.items():
-            rows.append(
-                {
-                    "kernel": "position-map",
-                    "case": f"{resolution}² texels",
-                    "backend": name,
-                    **summary(samples),
-                    "peak_mib": peak_mib(steps[name]) if name in steps else None,
-                    "value_error": errors[name] if same else float("inf"),
-                    "gradient_error": None,
-                }
-            )
+        for (name, samples), positions in zip(timings.items(), (cached, anew, None), strict=True):
+            error, memory = 0.0, None
+            if positions is not None:
+                off = positions[::step, ::step][common] - exact[common]
+                error, memory = float(np.linalg.norm(off, axis=-1).max(initial=0.0)), peak_mib(steps[name])
+            error = error if same else float("inf")
+            rows.append(row_of("position-map", f"{resolution}² texels", name, samples, memory, error))
     return rows
+
+
+def _anew(vertices: NDArray[np.float64], body: Body, resolution: int) -> NDArray[np.float64]:
+    return texel_table.__wrapped__(body, resolution).interpolate(vertices, body.faces)
 
 
 def brute_force_map(
     vertices: NDArray[np.float64],  # [V, 3] m
-    body: Any,
+    body: Body,
     resolution: int,
     step: int = 1,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:

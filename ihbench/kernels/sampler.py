@@ -19,7 +19,7 @@ from ihbench.diffusion.inpaint_config import InpaintConfig
 from ihbench.diffusion.mini.weights import load_mini
 from ihbench.diffusion.sampling import sample
 from ihbench.diffusion.subject_token import ANYBODY
-from ihbench.kernels.measuring import Row, interleave, peak_mib, summary, timed
+from ihbench.kernels.measuring import Row, interleave, peak_mib, row_of, timed
 from ihbench.scene.contracts import MaskState, TrainView
 
 STEPS = (1, 2, 3, 6, 12)
@@ -47,22 +47,11 @@ def sampler_rows(
         paint = {f"{n} steps": partial(_paint, backbone, batch, noise, n) for n in steps}
         timings = interleave({name: partial(timed, f) for name, f in paint.items()}, min(repeats, 3), warm_up=1)
         for name, samples in timings.items():
-            kept: list[Tensor] = []
-            memory = peak_mib(partial(_keep, kept, paint[name]))
-            painted = kept[0] if kept else paint[name]()
-            off = (painted.double() - exact)[hidden] / 2  # [-1, 1] has twice the range
-            rows.append(
-                {
-                    "kernel": "sampler",
-                    "case": f"mini, noise × {scale:g}, {view.crop.width}×{view.crop.height} px",
-                    "backend": name,
-                    "knob": "steps",
-                    **summary(samples),
-                    "peak_mib": memory,
-                    "value_error": float(off.square().mean().sqrt()),
-                    "gradient_error": None,
-                }
-            )
+            memory = peak_mib(paint[name])
+            off = (paint[name]().double() - exact)[hidden] / 2  # [-1, 1] has twice the range
+            error = float(off.square().mean().sqrt())
+            case = f"mini, noise × {scale:g}, {view.crop.width}×{view.crop.height} px"
+            rows.append(row_of("sampler", case, name, samples, memory, error, knob="steps"))
     return rows
 
 
@@ -79,10 +68,6 @@ def hidden_middle(size: int) -> CropView:
 
 def _paint(backbone: Backbone, batch: DiffusionBatch, noise: Tensor, steps: int) -> Tensor:
     return sample(backbone, batch, noise, ANYBODY, steps=steps, use_parts=True)
-
-
-def _keep(kept: list[Tensor], paint: partial) -> None:
-    kept.append(paint())
 
 
 def _exact(backbone: Backbone, batch: DiffusionBatch, noise: Tensor, many: int) -> Tensor:

@@ -6,7 +6,6 @@ kept in the cache): 374 views of 512², read from 1024² JPEG and PNG files. LPI
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -17,15 +16,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench.kernels.measuring import Row, peak_mib, summary
-from ihbench.kernels.metrics import headline_with
+from ihbench.kernels.measuring import Row, peak_mib, row_of, timed
+from ihbench.kernels.metrics import METRIC_SETS, headline_with
 
 if TYPE_CHECKING:
     from ihbench.scoring.scoring import LoadedView, Scorer
 
 PROTOCOL, PROFILE = "zju_occ", "paper"
 VIEWS = 374
-CASES = {"psnr+ssim": ("psnr", "ssim"), "psnr+ssim+flip": ("psnr", "ssim", "flip")}
 
 
 def score_rows(repeats: int, views: int = VIEWS, profile: str = PROFILE) -> list[Row]:
@@ -54,28 +52,18 @@ def score_rows(repeats: int, views: int = VIEWS, profile: str = PROFILE) -> list
         for index in indices:
             off = np.roll(scene.test[index].image, 1, axis=1)
             write_png(folder / "in" / f"{index}.png", rounded(off))
-        for case, metrics in CASES.items():
+        for case, metrics in METRIC_SETS.items():
             samples, memory = [], None
             for k in range(min(repeats, 3)):
                 fresh = open_scene(capture, protocol)  # holds no view of the last pass
                 scorer = replace(built, scene=fresh, presets=(headline_with(metrics),))
-                start = time.perf_counter()
+                step = partial(timed, partial(_score_all, scorer, folder, indices))
                 if k == 0:
-                    memory = peak_mib(partial(_score_all, scorer, folder, indices))
-                else:
-                    _score_all(scorer, folder, indices)
-                samples.append(((time.perf_counter() - start) * 1e3, None))
-            rows.append(
-                {
-                    "kernel": "score",
-                    "case": f"{len(indices)} views@{protocol.image.size}",
-                    "backend": case,
-                    **summary(samples),
-                    "peak_mib": memory,
-                    "value_error": None,
-                    "gradient_error": None,
-                }
-            )
+                    memory = peak_mib(lambda step=step, samples=samples: samples.append(step()))
+                if len(samples) == k:
+                    samples.append(step())
+            name = f"{len(indices)} views@{protocol.image.size}"
+            rows.append(row_of("score", name, case, samples, memory, None))
     return rows
 
 

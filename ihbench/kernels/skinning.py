@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ihbench.kernels.measuring import Row, Sample, interleave, peak_mib, summary, timed
+from ihbench.kernels.measuring import Row, Sample, interleave, peak_mib, row_of, timed
 
 LBS_CASES = (("12k points", 128), ("50k points", 256))  # texels of a map of this side, as an avatar has them
 ANGLE = 0.4  # rad, standard deviation of a joint's axis-angle components
@@ -52,17 +52,7 @@ def lbs_rows(repeats: int, cases: Sequence[tuple[str, int]] = LBS_CASES) -> list
                 found, *gradients = _skinned(getattr(torch, f"float{name[-2:]}"), given, body.parents)
                 value = float(np.linalg.norm(found.double().numpy() - exact, axis=-1).max())
                 gradient = max(_relative(g.double(), p) for g, p in zip(gradients[0], pulled, strict=True))
-            rows.append(
-                {
-                    "kernel": "lbs",
-                    "case": case,
-                    "backend": name,
-                    **summary(samples),
-                    "peak_mib": peak_mib(steps[name]),
-                    "value_error": value,
-                    "gradient_error": gradient,
-                }
-            )
+            rows.append(row_of("lbs", case, name, samples, peak_mib(steps[name]), value, gradient))
     return rows
 
 

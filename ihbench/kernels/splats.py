@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ihbench.camera import Camera, look_at
-from ihbench.kernels.measuring import Row, interleave, peak_mib, summary
+from ihbench.kernels.measuring import Row, interleave, peak_mib, row_of
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -159,8 +159,7 @@ def splat_rows(repeats: int, cases: Sequence[tuple[str, int, int]] = SPLAT_CASES
         on = {"cpu": scene}
         if torch.cuda.is_available():
             on["cuda"] = Gaussians(scene.means.cuda(), scene.scales.cuda(), scene.colors.cuda(), scene.camera)
-        backends = [b for b, package in (("numba", "numba"), ("gsplat", "gsplat")) if find_spec(package) is not None]
-        backends = [b for b in backends if b != "gsplat" or "cuda" in on]
+        backends = ["numba", *(["gsplat"] if "cuda" in on and find_spec("gsplat") is not None else [])]
 
         def step(backend: str, scenes: dict[str, Gaussians] = on) -> tuple[float, float]:
             scene = scenes["cuda" if backend == "gsplat" else "cpu"]
@@ -179,21 +178,12 @@ def splat_rows(repeats: int, cases: Sequence[tuple[str, int, int]] = SPLAT_CASES
         if case == cases[0][0]:
             timings |= interleave({"reference": lambda: step("reference")}, 1, warm_up=0)
         for backend, samples in timings.items():
-            errors = None
+            image = gradient = 0.0
             if backend != "reference":
-                place = on["cuda" if backend == "gsplat" else "cpu"]
-                errors = compare_with_twin(_window(place), backend)
-            rows.append(
-                {
-                    "kernel": "splat",
-                    "case": case,
-                    "backend": backend,
-                    **summary(samples),
-                    "peak_mib": peak_mib(lambda b=backend: step(b)) if backend == "numba" else None,
-                    "value_error": errors.image if errors else 0.0,
-                    "gradient_error": max(errors.gradient.values()) if errors else 0.0,
-                }
-            )
+                errors = compare_with_twin(_window(on["cuda" if backend == "gsplat" else "cpu"]), backend)
+                image, gradient = errors.image, max(errors.gradient.values())
+            memory = peak_mib(lambda b=backend: step(b)) if backend == "numba" else None
+            rows.append(row_of("splat", case, backend, samples, memory, image, gradient))
     return rows
 
 

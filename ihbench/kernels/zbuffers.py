@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
-from importlib.util import find_spec
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench.kernels.measuring import Row, interleave, peak_mib, summary
+from ihbench.kernels.measuring import Row, interleave, peak_mib, row_of, timed
 
 
 def zbuffer_rows(repeats: int, cases: Sequence[tuple[str, int, int]] = (("14k faces@512", 83, 512),)) -> list[Row]:
@@ -19,30 +18,15 @@ def zbuffer_rows(repeats: int, cases: Sequence[tuple[str, int, int]] = (("14k fa
     rows = []
     for case, rings, size in cases:
         points, faces = _sphere(rings, size)
-        backends = ["numpy", *(["numba"] if find_spec("numba") is not None else [])]
-
-        def step(backend: str, points=points, faces=faces, size=size) -> tuple[float, None]:
-            start = time.perf_counter()
-            rasterize(points, faces, size, size, backend)
-            return (time.perf_counter() - start) * 1e3, None
-
-        timings = interleave({b: lambda b=b: step(b) for b in backends}, repeats)
-        truth = rasterize(points, faces, size, size, "numpy")
+        steps = {b: partial(rasterize, points, faces, size, size, b) for b in ("numpy", "numba")}
+        timings = interleave({b: partial(timed, step) for b, step in steps.items()}, repeats)
+        truth = steps["numpy"]()
         for backend, samples in timings.items():
-            raster = rasterize(points, faces, size, size, backend)
+            raster = steps[backend]()
             both = truth.mask & raster.mask
             error = float(np.abs(raster.depth[both] - truth.depth[both]).max())
-            rows.append(
-                {
-                    "kernel": "zbuffer",
-                    "case": case,
-                    "backend": backend,
-                    **summary(samples),
-                    "peak_mib": peak_mib(lambda b=backend: step(b)),
-                    "value_error": error if (truth.face == raster.face).all() else float("inf"),
-                    "gradient_error": None,
-                }
-            )
+            error = error if (truth.face == raster.face).all() else float("inf")
+            rows.append(row_of("zbuffer", case, backend, samples, peak_mib(steps[backend]), error))
     return rows
 
 

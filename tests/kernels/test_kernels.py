@@ -148,7 +148,7 @@ def test_position_maps_are_held_against_a_twin_that_asks_every_face(monkeypatch)
     errors = {r["backend"]: r["value_error"] for r in rows}
     assert errors["table anew f64"] < 1e-12
     assert 0 < errors["cached table f32"] < 1e-6
-    monkeypatch.setattr("ihbench.body.position_map", lambda v, body, r: position_map(v[::-1], body, r))
+    monkeypatch.setattr(position_maps, "position_map", lambda v, body, r: position_map(v[::-1], body, r))
     wrong = {r["backend"]: r["value_error"] for r in position_maps.position_map_rows(1, (12,))}
     assert wrong["cached table f32"] > 0.1
 
