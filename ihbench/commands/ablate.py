@@ -23,7 +23,7 @@ from ihbench.scene.method_spec import method_spec
 if TYPE_CHECKING:
     from ihbench.clock.progress import Progress
     from ihbench.document.document import Block
-    from ihbench.runner.ablation import Ladder
+    from ihbench.runner.ablation import AblationSuite
     from ihbench.runner.executor import Cell, CellOutcome
     from ihbench.scene.data_source import DataSource
 
@@ -35,11 +35,11 @@ class AblateOptions(SceneChoice, Report):
     ladder: str = ""
     """A ladder of the method, such as table2 (`--ladder list` shows them all); by default its first."""
     vary: tuple[str, ...] = ()
-    """A grid instead of a ladder: NAME=VALUE:VALUE:..., such as levels=64:64,128 inpaint.on=on:off."""
+    """A grid instead of a suite: NAME=VALUE:VALUE:..., such as levels=64:64,128 inpaint.on=on:off."""
     set: tuple[str, ...] = ()
-    """Switches for every rung, NAME=VALUE, such as steps=200."""
+    """Switches for every variant, NAME=VALUE, such as steps=200."""
     keep: tuple[str, ...] = ()
-    """Fields that the plan must not change (`ihbench plan` lists them), or all. Fields that the rungs set are kept
+    """Fields that the plan must not change (`ihbench plan` lists them), or all. Fields that the variants set are kept
     anyway: what is compared is what was asked for."""
     seed: Annotated[tuple[int, ...], SEEDS] = (0, 1, 2)
     """Seeds; their scores are averaged per scene before anything is compared."""
@@ -49,7 +49,7 @@ class AblateOptions(SceneChoice, Report):
     """Runs at a time, each in a process of its own; by default one per core, on a GPU as many as its
     memory has room for. 0 runs them in this process."""
     share: bool = True
-    """Let rungs that begin alike share what they begin with; its seconds count in each of them."""
+    """Let variants that begin alike share what they begin with; its seconds count in each of them."""
     out: Path | None = None
     """Folder for the table (Markdown) and its numbers (JSON)."""
 
@@ -63,8 +63,8 @@ def _ablate(chosen: AblateOptions) -> int:
     from ihbench.clock.progress import Progress
 
     if chosen.ladder == "list":
-        for name, found in _ladders(chosen.method).items():
-            print(f"{name:<12}{len(found.rungs)} rungs: {found.title}")
+        for name, found in _suites(chosen.method).items():
+            print(f"{name:<12}{len(found.variants)} rungs: {found.title}")
         return 0
     config = profile_of(chosen)
     vary = {
@@ -81,7 +81,7 @@ def _ablate(chosen: AblateOptions) -> int:
 def ablated(
     chosen: AblateOptions, vary: Mapping[str, Sequence[Any]], switches: Mapping[str, Any], progress: Progress
 ) -> tuple[list[Block], dict[str, Any], list[CellOutcome]]:
-    """Do the runs of a ladder, or of the grid `vary`, with `switches` on every rung: the table and its
+    """Do the runs of a suite, or of the grid `vary`, with `switches` on every variant: the table and its
     numbers, and how each run ended. The options' own words for both are not read. Raises `BadInput`."""
     from ihbench.clock.machine import usable_cores
     from ihbench.record import outputs
@@ -94,8 +94,8 @@ def ablated(
     check_device(chosen.device)
     if chosen.out is not None:
         outputs.check(chosen.out, ["ablation.md", "ablation.json"])
-    ladder = _ladder(chosen, vary, switches)
-    cells = _cells(chosen, ladder, progress)
+    suite = _suite(chosen, vary, switches)
+    cells = _cells(chosen, suite, progress)
     cores, cards = usable_cores(), None
     workers = cores if chosen.workers is None else chosen.workers
     if chosen.device == "cuda" and workers:
@@ -103,8 +103,8 @@ def ablated(
         workers = len(cards)
     threads = max(cores // max(min(workers, len(cells)), 1), 1)
     outcomes = run_cells([cell for _, cell in cells], workers, threads, progress, cards)
-    rungs = [rung for rung, _ in cells]
-    blocks, numbers = registry.load("table", "ablation")(ladder, list(zip(rungs, outcomes, strict=True)))
+    variants = [variant for variant, _ in cells]
+    blocks, numbers = registry.load("table", "ablation")(suite, list(zip(variants, outcomes, strict=True)))
     return blocks, numbers, outcomes
 
 
@@ -125,21 +125,21 @@ def profile_of(chosen: AblateOptions) -> Any:
     return configuration(chosen.method, chosen.profile, {})
 
 
-def _ladders(method: str) -> dict[str, Ladder]:
+def _suites(method: str) -> dict[str, AblationSuite]:
     spec = method_spec(method)
     return spec.load(spec.ablations) if spec.ablations else {}
 
 
-def _ladder(chosen: AblateOptions, vary: Mapping[str, Sequence[Any]], switches: Mapping[str, Any]) -> Ladder:
+def _suite(chosen: AblateOptions, vary: Mapping[str, Sequence[Any]], switches: Mapping[str, Any]) -> AblationSuite:
     from ihbench.runner.ablation import grid, set_on_all
 
     config = profile_of(chosen)
     if vary:
         if chosen.ladder:
             raise BadInput(f"--ladder {chosen.ladder} with --vary: expected one of the two")
-        ladder = grid(config, vary)
+        suite = grid(config, vary)
     else:
-        known = _ladders(chosen.method)
+        known = _suites(chosen.method)
         if not known:
             raise BadInput(
                 f"method {chosen.method!r} registers no ladder; name switches with --vary NAME=VALUE:VALUE"
@@ -147,11 +147,11 @@ def _ladder(chosen: AblateOptions, vary: Mapping[str, Sequence[Any]], switches: 
         name = chosen.ladder or next(iter(known))
         if name not in known:
             raise BadInput(f"--ladder {name}: {registry.nearest(name, list(known))}")
-        ladder = known[name]
+        suite = known[name]
     for name in switches:
         if name in vary:
             raise BadInput(f"--set {name}={switches[name]}: --vary gives it its values; leave one of the two out")
-    return set_on_all(ladder, switches)
+    return set_on_all(suite, switches)
 
 
 def _named(words: Sequence[str], flag: str) -> dict[str, str]:
@@ -187,8 +187,8 @@ def _value(chosen: AblateOptions, config: Any, name: str, text: str) -> Any:
     return flat(options(Switches, [flag, *words], "ablate", "").config)[name]
 
 
-def _cells(chosen: AblateOptions, ladder: Ladder, progress: Any) -> list[tuple[str, Cell]]:
-    """Rung and cell of every run: seeds outermost, so that an early table holds every rung."""
+def _cells(chosen: AblateOptions, suite: AblationSuite, progress: Any) -> list[tuple[str, Cell]]:
+    """Variant and cell of every run: seeds outermost, so that an early table holds every variant."""
     from ihbench.runner.ablation import configured, kept, shared_part
     from ihbench.runner.executor import Cell
     from ihbench.runner.run_loop import RunRequest
@@ -206,9 +206,9 @@ def _cells(chosen: AblateOptions, ladder: Ladder, progress: Any) -> list[tuple[s
         for seed in chosen.seed:
             for scene in source.scenes:
                 first: dict[Any, int] = {}
-                for rung in ladder.rungs:
-                    own = configured(rung, config)
-                    keep = tuple(dict.fromkeys((*chosen.keep, *kept(ladder, rung, config))))
+                for variant in suite.variants:
+                    own = configured(variant, config)
+                    keep = tuple(dict.fromkeys((*chosen.keep, *kept(suite, variant, config))))
                     request = RunRequest(
                         protocol, chosen.method, own, seed, chosen.device, chosen.runs, chosen.body,
                         keep=keep, share=bool(shared),
@@ -217,9 +217,9 @@ def _cells(chosen: AblateOptions, ladder: Ladder, progress: Any) -> list[tuple[s
                     for free in shared.values():
                         pinned = tuple(name for name in keep if not name.startswith(tuple(free)))
                         after = first.setdefault((shared_part(own, free), pinned), len(cells))
-                    name = f"{protocol.name} {scene} seed {seed}, {rung.name}"
+                    name = f"{protocol.name} {scene} seed {seed}, {variant.name}"
                     waits = after if after != len(cells) else None
-                    cells.append((rung.name, Cell(name, request, source, scene, waits)))
+                    cells.append((variant.name, Cell(name, request, source, scene, waits)))
     for source in sources:  # only now that every value is known to be good
         _open_all(source, chosen.body, progress)
     return cells

@@ -1,6 +1,7 @@
-"""What of a method is worth its minutes: ladders of configurations, and the runs that they mean.
+"""What of a method is worth its minutes: suites of configurations, and the runs that they mean.
 
-A method registers ladders under `ihbench.ladders`: name -> `Ladder`. A grid of switches makes one on the spot.
+A method registers suites in its spec (`MethodSpec.ablations`): name -> `AblationSuite`. A grid of switches
+makes one on the spot.
 """
 
 from __future__ import annotations
@@ -14,11 +15,11 @@ from ihbench.config_fields import flat, refuse_repeated, with_fields
 from ihbench.errors import BadInput
 
 GRID = "grid"
-ROOM = 60  # letters of a rung's name
+ROOM = 60  # letters of a variant's name
 
 
 @dataclass(frozen=True)
-class Rung:
+class Variant:
     """One configuration: what differs from the profile, and what a paper says of it."""
 
     name: str
@@ -29,7 +30,7 @@ class Rung:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two rungs of a ladder whose difference is one component."""
+    """Two variants of a suite whose difference is one component."""
 
     what: str
     without: str
@@ -37,16 +38,16 @@ class Comparison:
 
 
 @dataclass(frozen=True)
-class Ladder:
+class AblationSuite:
     """Configurations, and the comparisons between them that say what each component is worth."""
 
     title: str
-    rungs: tuple[Rung, ...]
+    variants: tuple[Variant, ...]
     comparisons: tuple[Comparison, ...]
     note: str = ""
 
     def __post_init__(self) -> None:
-        names = [rung.name for rung in self.rungs]
+        names = [variant.name for variant in self.variants]
         if len(set(names)) < len(names) or not names:
             raise ValueError(f"ladder {self.title}: expected rungs of different names, got {names}")
         for comparison in self.comparisons:
@@ -54,7 +55,7 @@ class Ladder:
                 raise ValueError(f"ladder {self.title}: {comparison} compares rungs that it does not have")
 
 
-def grid(config: Any, vary: Mapping[str, Sequence[Any]]) -> Ladder:
+def grid(config: Any, vary: Mapping[str, Sequence[Any]]) -> AblationSuite:
     """All combinations of the values of some switches; every one is compared with the first.
 
     Raises `BadInput` for a switch that the configuration does not have, one without values, and a value given twice.
@@ -68,10 +69,10 @@ def grid(config: Any, vary: Mapping[str, Sequence[Any]]) -> Ladder:
         refuse_repeated(values, f"--vary {name}")
     combinations = product(*vary.values())
     grids = [dict(zip(vary, values, strict=True)) for values in combinations]
-    rungs = [Rung(name, switches) for name, switches in zip(_names(grids), grids, strict=True)]
-    first = rungs[0].name
-    comparisons = tuple(Comparison(f"{rung.name} instead of {first}", first, rung.name) for rung in rungs[1:])
-    return Ladder(", ".join(vary), tuple(rungs), comparisons)
+    variants = [Variant(name, switches) for name, switches in zip(_names(grids), grids, strict=True)]
+    first = variants[0].name
+    comparisons = tuple(Comparison(f"{one.name} instead of {first}", first, one.name) for one in variants[1:])
+    return AblationSuite(", ".join(vary), tuple(variants), comparisons)
 
 
 def _names(grids: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -83,13 +84,13 @@ def _names(grids: Sequence[Mapping[str, Any]]) -> list[str]:
     return [text if len(text) <= ROOM else f"{k + 1}: {text[: ROOM - 1]}…" for k, text in enumerate(words)]
 
 
-def kept(ladder: Ladder, rung: Rung, config: Any) -> tuple[str, ...]:
-    """Fields that the plan must leave as the rung has them: its own, and those by which rungs of the ladder differ,
-    as far as the rung has them at the profile's value (what differs from the profile stays anyway)."""
-    if any(other.keep for other in ladder.rungs):
-        return rung.keep  # a ladder about the plan itself
-    own, base = flat(configured(rung, config)), flat(config)
-    set_by_any = sorted({name for other in ladder.rungs for name in other.switches})
+def kept(suite: AblationSuite, variant: Variant, config: Any) -> tuple[str, ...]:
+    """Fields that the plan must leave as the variant has them: its own, and those by which variants of the suite
+    differ, as far as the variant has them at the profile's value (what differs from the profile stays anyway)."""
+    if any(other.keep for other in suite.variants):
+        return variant.keep  # a suite about the plan itself
+    own, base = flat(configured(variant, config)), flat(config)
+    set_by_any = sorted({name for other in suite.variants for name in other.switches})
     return tuple(name for name in set_by_any if own[name] == base[name])
 
 
@@ -97,19 +98,19 @@ def _plain(value: Any) -> str:
     return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
 
-def configured(rung: Rung, config: Any) -> Any:
-    """The profile's configuration with a rung's switches. Raises `BadInput` for unknown ones."""
+def configured(variant: Variant, config: Any) -> Any:
+    """The profile's configuration with a variant's switches. Raises `BadInput` for unknown ones."""
     known = flat(config)
-    for name in rung.switches:
+    for name in variant.switches:
         if name not in known:
-            raise BadInput(f"rung {rung.name!r}: the method has no switch {name!r}")
-    return with_fields(config, rung.switches)
+            raise BadInput(f"rung {variant.name!r}: the method has no switch {name!r}")
+    return with_fields(config, variant.switches)
 
 
-def set_on_all(ladder: Ladder, switches: Mapping[str, Any]) -> Ladder:
-    """The ladder with further switches on every rung, where a rung does not set them itself."""
-    rungs = tuple(replace(rung, switches={**switches, **rung.switches}) for rung in ladder.rungs)
-    return replace(ladder, rungs=rungs)
+def set_on_all(suite: AblationSuite, switches: Mapping[str, Any]) -> AblationSuite:
+    """The suite with further switches on every variant, where a variant does not set them itself."""
+    variants = tuple(replace(variant, switches={**switches, **variant.switches}) for variant in suite.variants)
+    return replace(suite, variants=variants)
 
 
 def shared_part(config: Any, free: Sequence[str]) -> tuple[tuple[str, Any], ...]:

@@ -190,12 +190,12 @@ class _Run(RecordedRun):
     def _take_shared_states(self) -> None:
         """Copy saved states of finished runs that differ only in fields on which these states do not depend. Their
         seconds count as this run's own: the clock is saved with a state."""
-        from ihbench.runner.shared_states import lend, lender
+        from ihbench.runner.shared_states import reusable_run, reuse_state
 
         for state, free in method_spec(self.request.method).shared_states.items():
-            other = lender(self.request.runs, self.folder, state, free, machine.identity())
+            other = reusable_run(self.request.runs, self.folder, state, free, machine.identity())
             if other is not None:
-                self.ledger.events += lend(other, self.folder, state)  # that it went back, say
+                self.ledger.events += reuse_state(other, self.folder, state)  # that it went back, say
                 self.ledger.event(Reused(state, other.record.digest))
 
     def _render(self, avatar: Avatar, view: TestView) -> NDArray[np.float32]:

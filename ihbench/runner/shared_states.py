@@ -18,7 +18,7 @@ from ihbench.record.store import RunFolder
 SAME_CLOCK = ("cpu", "gpu", "torch_threads")  # of a machine's identity: the state's seconds come with it
 
 
-def lender(runs: Path, borrower: RunFolder, state: str, free: Sequence[str], here: Machine) -> RunFolder | None:
+def reusable_run(runs: Path, borrower: RunFolder, state: str, free: Sequence[str], here: Machine) -> RunFolder | None:
     """A finished run under `runs` that has `state`, was made on such a machine as `here` with as many threads, and
     whose identity differs from the borrower's at most in configuration fields whose names begin with one of `free`;
     None when there is none, or nothing is missing."""
@@ -38,7 +38,7 @@ def lender(runs: Path, borrower: RunFolder, state: str, free: Sequence[str], her
     return None
 
 
-def lend(other: RunFolder, borrower: RunFolder, state: str) -> list[Event]:
+def reuse_state(other: RunFolder, borrower: RunFolder, state: str) -> list[Event]:
     """Copy the state, and the points of the quality-time curve up to it. Gives the ledger's events of that stage."""
     target = state_file(borrower.path, state)
     atomic.write_bytes(target, state_file(other.path, state).read_bytes())

@@ -31,7 +31,7 @@ SPEC = MethodSpec(
     leave_out=f"{PACKAGE}.config:leave_out",
     outside_files=f"{PACKAGE}.config:outside_files",
     shared_states={STAGE1: ("inpaint.", "refine.")},
-    ablations=f"{PACKAGE}.studies.ladders:LADDERS",
+    ablations=f"{PACKAGE}.studies.ablations:SUITES",
     stress=f"{PACKAGE}.studies.stress:CASES",
     commands={
         "ceiling": Command(

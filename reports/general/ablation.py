@@ -1,4 +1,4 @@
-"""The ablation table: every rung of a ladder, and what each component is worth in quality and in seconds.
+"""The ablation table: every variant of a suite, and what each component is worth in quality and in seconds.
 
 Seeds are averaged within a scene; the scene is the unit of intervals and tests.
 """
@@ -17,41 +17,41 @@ from ihbench.record.results import RunResult
 from ihbench.reports.general.clock import clock_notes, one_clock
 from ihbench.reports.general.content import data_words
 from ihbench.reports.general.significance import ALPHA, LEVEL, per_scene
-from ihbench.runner.ablation import Comparison, Ladder
+from ihbench.runner.ablation import AblationSuite, Comparison
 from ihbench.runner.executor import CellOutcome
 
 REGIONS = ("visible", "hidden", "never_seen")  # beside the headline
 PAPER = {"psnr": ("PSNR", 2), "ssim": ("SSIM", 4), "lpips": ("LPIPS*", 2)}
 
-Found = list[tuple[str, CellOutcome]]  # rung and outcome of every run
+Found = list[tuple[str, CellOutcome]]  # variant and outcome of every run
 
 
-def write(ladder: Ladder, found: Found) -> tuple[list[Block], dict[str, Any]]:
+def write(suite: AblationSuite, found: Found) -> tuple[list[Block], dict[str, Any]]:
     """The document, and its numbers for programs (strict JSON). One table for each protocol."""
     protocols: dict[str, Found] = {}
-    for rung, outcome in found:
-        protocols.setdefault(outcome.cell.request.protocol.name, []).append((rung, outcome))
-    blocks: list[Block] = [Heading(2, f"Ablation: {ladder.title}")]
+    for variant, outcome in found:
+        protocols.setdefault(outcome.cell.request.protocol.name, []).append((variant, outcome))
+    blocks: list[Block] = [Heading(2, f"Ablation: {suite.title}")]
     tables = []
     for protocol, cells in protocols.items():
-        told, numbers = _table(ladder, protocol, cells)
+        told, numbers = _table(suite, protocol, cells)
         blocks += told
         tables.append(numbers)
     if len(tables) > 1:
-        blocks += _severities(ladder, tables)
+        blocks += _severities(suite, tables)
     failures = [_failure(outcome) for _, outcome in found if not outcome.done]
     if failures:
         blocks += [Paragraph("Not done:"), *bullets(failures)]
-    if ladder.note:
-        blocks.append(Paragraph(ladder.note))
-    return blocks, {"ladder": ladder.title, "tables": tables, "failed": failures}
+    if suite.note:
+        blocks.append(Paragraph(suite.note))
+    return blocks, {"ladder": suite.title, "tables": tables, "failed": failures}
 
 
-def _table(ladder: Ladder, protocol: str, cells: Found) -> tuple[list[Block], dict[str, Any]]:
-    runs: dict[str, list[RunResult]] = {rung.name: [] for rung in ladder.rungs}
-    for rung, outcome in cells:
+def _table(suite: AblationSuite, protocol: str, cells: Found) -> tuple[list[Block], dict[str, Any]]:
+    runs: dict[str, list[RunResult]] = {variant.name: [] for variant in suite.variants}
+    for variant, outcome in cells:
         if outcome.done and outcome.result is not None:
-            runs[rung].append(outcome.result)
+            runs[variant].append(outcome.result)
     done = [run for having in runs.values() for run in having]
     request = cells[0][1].cell.request
     blocks: list[Block] = [Heading(3, f"{protocol}, {request.method}, {request.protocol.profile} profile")]
@@ -59,40 +59,40 @@ def _table(ladder: Ladder, protocol: str, cells: Found) -> tuple[list[Block], di
         return [*blocks, Paragraph("No run was finished.")], {"protocol": protocol, "rungs": {}, "comparisons": []}
     headline = done[0].headline
     columns = _columns(done, headline)
-    quoted = [m for m in PAPER if any(m in rung.paper for rung in ladder.rungs)]
+    quoted = [m for m in PAPER if any(m in variant.paper for variant in suite.variants)]
     titles = [f"{i.display.title} {i.region} {i.display.arrow}" for i in columns]
     titles += ["fit s"] + [f"paper's {PAPER[m][0]}" for m in quoted]
     blocks.append(Paragraph(("Data: ", *data_words(done[0]), ".")))
     lines: list[tuple[Words, ...]] = []
-    rungs: dict[str, Any] = {}
-    for rung in ladder.rungs:
-        having = runs[rung.name]
-        asked = sum(name == rung.name for name, _ in cells)
+    variants: dict[str, Any] = {}
+    for variant in suite.variants:
+        having = runs[variant.name]
+        asked = sum(name == variant.name for name, _ in cells)
         scores = {i: _interval(per_scene(having, i)) for i in columns}
         seconds = _interval(_seconds(having)) if one_clock(having) else None
         cells_shown = [_shown(scores[i], i.display) for i in columns] + [_whole(seconds)]
-        cells_shown += [f"{rung.paper[m]:.{PAPER[m][1]}f}" if m in rung.paper else "" for m in quoted]
+        cells_shown += [f"{variant.paper[m]:.{PAPER[m][1]}f}" if m in variant.paper else "" for m in quoted]
         counted = f"{len(having)}" if len(having) == asked else f"{len(having)} of {asked}"
         scenes = len({run.scene for run in having})
-        lines.append((rung.name, str(scenes), counted, *cells_shown))
-        rungs[rung.name] = {
-            "switches": {name: _plain(value) for name, value in rung.switches.items()},
+        lines.append((variant.name, str(scenes), counted, *cells_shown))
+        variants[variant.name] = {
+            "switches": {name: _plain(value) for name, value in variant.switches.items()},
             "runs": len(having),
             "asked": asked,
             "scores": {str(i): _numbers(interval) for i, interval in scores.items()},
             "fit_seconds": _numbers(seconds),
             "left_out": _omissions(having),
-            "paper": dict(rung.paper),
+            "paper": dict(variant.paper),
         }
     blocks.append(Table(("rung", "scenes", "runs", *titles), tuple(lines)))
     blocks += bullets([*_left_out(runs), *clock_notes(_timed(runs))])
-    told, compared = _comparisons(ladder.comparisons, runs, columns)
+    told, compared = _comparisons(suite.comparisons, runs, columns)
     if quoted:
         quoted_from = "The paper's numbers are quoted: its own data, whole images, LPIPS* = 1000 × LPIPS."
         blocks.append(Paragraph(quoted_from))
     if told:
         blocks += [Paragraph("What each component is worth (paired over scenes, mean over seeds):"), *told]
-    return blocks, {"protocol": protocol, "headline": headline, "rungs": rungs, "comparisons": compared}
+    return blocks, {"protocol": protocol, "headline": headline, "rungs": variants, "comparisons": compared}
 
 
 def _omissions(runs: Sequence[RunResult]) -> dict[str, int]:
@@ -102,22 +102,22 @@ def _omissions(runs: Sequence[RunResult]) -> dict[str, int]:
 
 
 def _left_out(runs: Mapping[str, Sequence[RunResult]]) -> list[str]:
-    """A line for each rung that the plan has changed."""
+    """A line for each variant that the plan has changed."""
     lines = []
-    for rung, having in runs.items():
+    for variant, having in runs.items():
         omissions = [f"{what} in {n} of {len(having)} runs" for what, n in _omissions(having).items()]
         if omissions:
-            lines.append(f"left out by the plan, {rung}: {'; '.join(omissions)}")
+            lines.append(f"left out by the plan, {variant}: {'; '.join(omissions)}")
     return lines
 
 
 def _timed(runs: Mapping[str, Sequence[RunResult]]) -> dict[str, list[RunResult]]:
-    """Rung -> its runs that have a clock."""
+    """Variant -> its runs that have a clock."""
     found = {}
-    for rung, having in runs.items():
+    for variant, having in runs.items():
         timed = [run for run in having if run.timed]
         if timed:
-            found[rung] = timed
+            found[variant] = timed
     return found
 
 
@@ -228,8 +228,8 @@ def _seconds_text(pair: dict[str, Any] | None) -> str:
     return f"{pair['mean']:+z.0f}{interval}{share}"
 
 
-def _severities(ladder: Ladder, tables: Sequence[Mapping[str, Any]]) -> list[Block]:
-    """One line a rung, one column a protocol: the headline's first metric."""
+def _severities(suite: AblationSuite, tables: Sequence[Mapping[str, Any]]) -> list[Block]:
+    """One line a variant, one column a protocol: the headline's first metric."""
     having = [table for table in tables if table["rungs"]]
     if not having:
         return []
@@ -237,9 +237,9 @@ def _severities(ladder: Ladder, tables: Sequence[Mapping[str, Any]]) -> list[Blo
     identity = Identity.parse(first)
     metric = identity.display
     lines: list[tuple[Words, ...]] = []
-    for rung in ladder.rungs:
-        scores = [table["rungs"].get(rung.name, {}).get("scores", {}).get(first) for table in having]
-        lines.append((rung.name, *("—" if s is None else metric.text(s["mean"]) for s in scores)))
+    for variant in suite.variants:
+        scores = [table["rungs"].get(variant.name, {}).get("scores", {}).get(first) for table in having]
+        lines.append((variant.name, *("—" if s is None else metric.text(s["mean"]) for s in scores)))
     title = f"{metric.title} {identity.region} {metric.arrow} over protocols"
     return [Heading(3, title), Table(("rung", *(table["protocol"] for table in having)), tuple(lines))]
 

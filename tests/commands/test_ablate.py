@@ -1,4 +1,4 @@
-"""`ihbench ablate`: the runs that a ladder means, what they share, what a failed one leaves of the others."""
+"""`ihbench ablate`: the runs that a suite means, what they share, what a failed one leaves of the others."""
 
 from __future__ import annotations
 
@@ -23,16 +23,25 @@ from ihbench.files.atomic import read_json
 from ihbench.methods.inpainthuman.config import LEAST_TEXELS, PROFILES, QUICK
 from ihbench.methods.inpainthuman.method import InpaintHuman
 from ihbench.methods.inpainthuman.spec import SPEC, STAGE1
-from ihbench.methods.inpainthuman.studies.ladders import LADDERS
+from ihbench.methods.inpainthuman.studies.ablations import SUITES
 from ihbench.metrics import Identity
 from ihbench.record.results import read_result
 from ihbench.record.schema import CurvePoint
 from ihbench.record.store import RunFolder
 from ihbench.runner import executor as cells_module
-from ihbench.runner.ablation import Comparison, Ladder, Rung, configured, grid, kept, set_on_all, shared_part
+from ihbench.runner.ablation import (
+    AblationSuite,
+    Comparison,
+    Variant,
+    configured,
+    grid,
+    kept,
+    set_on_all,
+    shared_part,
+)
 from ihbench.runner.executor import Cell, run_cells
 from ihbench.runner.run_loop import RunRequest, _planned
-from ihbench.runner.shared_states import lend, lender
+from ihbench.runner.shared_states import reusable_run, reuse_state
 from ihbench.scene.data_source import DataSource
 from ihbench.scene.plan import SceneMeasure
 from ihbench.scene.protocol import load_protocol
@@ -58,39 +67,39 @@ def ablate(bench, *words, on=("inpaint.on=off",)):
 
 
 def test_a_grid_is_every_combination_and_compares_with_the_first():
-    ladder = grid(QUICK, {"levels": [(64,), (64, 128)], "inpaint.on": [True, False]})
-    assert [dict(rung.switches) for rung in ladder.rungs] == [
+    suite = grid(QUICK, {"levels": [(64,), (64, 128)], "inpaint.on": [True, False]})
+    assert [dict(variant.switches) for variant in suite.variants] == [
         {"levels": levels, "inpaint.on": on} for levels in ((64,), (64, 128)) for on in (True, False)
     ]
-    assert {c.without for c in ladder.comparisons} == {"levels=64, inpaint.on=True"}
-    assert len(ladder.comparisons) == 3
+    assert {c.without for c in suite.comparisons} == {"levels=64, inpaint.on=True"}
+    assert len(suite.comparisons) == 3
     with pytest.raises(BadInput, match="no such switch"):
         grid(QUICK, {"level": [1]})
 
 
 def test_a_grid_names_every_combination_apart():
-    assert [rung.name for rung in grid(QUICK, {"steps": [100, 200]}).rungs] == ["steps=100", "steps=200"]
+    assert [variant.name for variant in grid(QUICK, {"steps": [100, 200]}).variants] == ["steps=100", "steps=200"]
     with pytest.raises(BadInput, match="stands there twice"):
         grid(QUICK, {"steps": [100, 200, 100]})
     many = {"inpaint.sampler_steps": [6, 12], "inpaint.key_views": [20], "refine.warm_up": [0.1, 0.2]}
-    names = [rung.name for rung in grid(QUICK, many).rungs]
+    names = [variant.name for variant in grid(QUICK, many).variants]
     assert len(set(names)) == 4
     assert names[0] == "inpaint.sampler_steps=6, refine.warm_up=0.1"  # what does not vary is no name
     long = {f"inpaint.{name}": [3e-4, 1.23456789e-4] for name in ("ti_lr", "lora_lr", "control_lr")}
-    names = [rung.name for rung in grid(QUICK, long).rungs]
+    names = [variant.name for variant in grid(QUICK, long).variants]
     assert len(set(names)) == 8
     assert max(map(len, names)) < 70
 
 
 def test_what_is_compared_is_kept_from_the_plan():
-    """A rung has what it says, also where it says what the profile has anyway."""
-    ladder = grid(QUICK, {"texels": [QUICK.texels, 2 * QUICK.texels], "inpaint.on": [True]})
-    assert [kept(ladder, rung, QUICK) for rung in ladder.rungs] == [("inpaint.on", "texels"), ("inpaint.on",)]
-    ladder = LADDERS["table2"]
-    full = ladder.rungs[-1]
-    assert set(kept(ladder, full, QUICK)) == {"levels", "one_fit", "inpaint.on", "inpaint.ti", "inpaint.sg"}
-    plan = LADDERS["plan"]
-    assert [kept(plan, rung, QUICK) for rung in plan.rungs] == [("all",), ()]
+    """A variant has what it says, also where it says what the profile has anyway."""
+    suite = grid(QUICK, {"texels": [QUICK.texels, 2 * QUICK.texels], "inpaint.on": [True]})
+    assert [kept(suite, variant, QUICK) for variant in suite.variants] == [("inpaint.on", "texels"), ("inpaint.on",)]
+    suite = SUITES["table2"]
+    full = suite.variants[-1]
+    assert set(kept(suite, full, QUICK)) == {"levels", "one_fit", "inpaint.on", "inpaint.ti", "inpaint.sg"}
+    plan = SUITES["plan"]
+    assert [kept(plan, variant, QUICK) for variant in plan.variants] == [("all",), ()]
 
 
 @pytest.mark.parametrize(("keep", "texels"), [((), 32), (("texels",), QUICK.texels)])
@@ -108,30 +117,30 @@ def test_the_plan_changes_only_what_nobody_has_set(moving, keep, texels):
 
 def test_a_ladder_compares_its_own_rungs_only():
     with pytest.raises(ValueError, match="does not have"):
-        Ladder("x", (Rung("a"),), (Comparison("what", "a", "b"),))
+        AblationSuite("x", (Variant("a"),), (Comparison("what", "a", "b"),))
     with pytest.raises(ValueError, match="different names"):
-        Ladder("x", (Rung("a"), Rung("a")), ())
+        AblationSuite("x", (Variant("a"), Variant("a")), ())
 
 
 def test_what_is_set_on_all_does_not_overrule_a_rung():
-    ladder = set_on_all(Ladder("x", (Rung("a"), Rung("b", {"steps": 7})), ()), {"steps": 3, "texels": 32})
-    assert [configured(rung, QUICK).steps for rung in ladder.rungs] == [3, 7]
-    assert {configured(rung, QUICK).texels for rung in ladder.rungs} == {32}
+    suite = set_on_all(AblationSuite("x", (Variant("a"), Variant("b", {"steps": 7})), ()), {"steps": 3, "texels": 32})
+    assert [configured(variant, QUICK).steps for variant in suite.variants] == [3, 7]
+    assert {configured(variant, QUICK).texels for variant in suite.variants} == {32}
 
 
-@pytest.mark.parametrize("name", LADDERS)
+@pytest.mark.parametrize("name", SUITES)
 @pytest.mark.parametrize("profile", PROFILES)
 def test_every_rung_of_the_method_is_a_configuration_of_its_own(name, profile):
-    ladder = LADDERS[name]
-    found = [configured(rung, PROFILES[profile]) for rung in ladder.rungs]
-    keys = {(tuple(flat(config).items()), rung.keep) for config, rung in zip(found, ladder.rungs, strict=True)}
+    suite = SUITES[name]
+    found = [configured(variant, PROFILES[profile]) for variant in suite.variants]
+    keys = {(tuple(flat(config).items()), one.keep) for config, one in zip(found, suite.variants, strict=True)}
     assert len(keys) == len(found)
 
 
 def test_the_papers_rungs_share_their_first_stage_by_the_maps_they_have():
-    ladder = LADDERS["table2"]
+    suite = SUITES["table2"]
     free = SPEC.shared_states[STAGE1]
-    keys = {rung.name: shared_part(configured(rung, QUICK), free) for rung in ladder.rungs}
+    keys = {variant.name: shared_part(configured(variant, QUICK), free) for variant in suite.variants}
     assert len(set(keys.values())) == 3  # the one fit is another stage 1
     assert keys["one level"] == keys["one level, diffusion"] != keys["MS"] == keys["MS + TI + SG"]
 
@@ -167,7 +176,7 @@ def the_table_holds_the_means_of_its_runs(bench, outcome, out):
     first = next(iter(comparison["scores"]))
     before, after = (table["rungs"][f"steps={s}"]["scores"][first]["mean"] for s in (2, 6))
     assert comparison["scores"][first]["mean"] == pytest.approx(after - before)
-    assert outcome.out == (out / "ablation.md").read_text(encoding="utf-8") + "\n"
+    assert outcome.out == (out / "ablation.md").read_text(encoding="utf-8")
     assert "stand-in" in outcome.out
 
 
@@ -212,11 +221,11 @@ def test_a_scene_that_cannot_be_opened_does_not_take_the_others_along(bench, mon
 
 def test_a_rung_can_keep_what_the_plan_would_leave_out(bench):
     """And shares nothing with one that does not keep it."""
-    ladder = LADDERS["plan"]
+    suite = SUITES["plan"]
     chosen = AblateOptions(protocol=str(bench.protocol), scene=(SCENES[0],), seed=(0, 1), runs=bench.runs)
     with bench.in_its_world():
-        cells = ablate_command._cells(chosen, ladder, Progress.silent())
-    assert [rung for rung, _ in cells] == ["everything", "planned"] * 2
+        cells = ablate_command._cells(chosen, suite, Progress.silent())
+    assert [variant for variant, _ in cells] == ["everything", "planned"] * 2
     assert [cell.request.keep for _, cell in cells] == [("all",), ()] * 2
     assert [(c.request.config.cull, c.request.config.crop) for _, c in cells] == [(False, False), (True, True)] * 2
     assert [cell.request.seed for _, cell in cells] == [0, 0, 1, 1]
@@ -254,7 +263,7 @@ def test_nothing_is_lent_across_clocks_or_other_beginnings(tmp_path):
         Ledger(tmp_path / "lends").save_state("stage1", {"x": np.zeros(3)}, {"step": 600})
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(RunFolder, "open", lambda path: lending)
-            return lender(tmp_path, run("borrows", keep=["inpaint.on"]), "stage1", ("inpaint.",), here)
+            return reusable_run(tmp_path, run("borrows", keep=["inpaint.on"]), "stage1", ("inpaint.",), here)
 
     good = run("lends", inpaint={"on": False})
     assert found(good) is good
@@ -276,7 +285,7 @@ def test_what_happened_in_a_lent_stage_is_told_of_the_borrower_too(tmp_path):
     points = [CurvePoint(step, 1.0, {}) for step in (300, 600, 700)]
     other = SimpleNamespace(path=lender, record=SimpleNamespace(events=ledger.events), curve=lambda: points)
     borrower.mkdir()
-    events = lend(other, SimpleNamespace(path=borrower), "stage1")  # pyright: ignore
+    events = reuse_state(other, SimpleNamespace(path=borrower), "stage1")  # pyright: ignore
     assert [(event.kind, event.data["step"]) for event in events] == [("rolled_back", 25)]
     assert Ledger(borrower).load_state("stage1")[1] == {"step": 600}  # pyright: ignore
     assert len((borrower / "curve.jsonl").read_text().splitlines()) == 2

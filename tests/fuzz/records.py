@@ -27,9 +27,9 @@ from ihbench.record.results import read_result
 from ihbench.record.schema import CurvePoint, PredictionFiles, PresetHead, ScoreLine
 from ihbench.record.store import RunFolder
 from ihbench.reports.general import ablation
-from ihbench.runner.ablation import Comparison, Ladder, Rung
+from ihbench.runner.ablation import AblationSuite, Comparison, Variant
 from ihbench.runner.executor import Cell, CellOutcome
-from ihbench.runner.shared_states import lend, lender
+from ihbench.runner.shared_states import reusable_run, reuse_state
 from ihbench.scene.plan import Omission
 from tests.reports.fake_runs import LPIPS, about, identity, means
 
@@ -274,19 +274,19 @@ def _ablation(runs: Path, good: Path, victim: Path) -> None:
     from ihbench.runner.run_loop import RunRequest
     from tests.bench.fake_capture import fake_protocol
 
-    ladder = Ladder("t", (Rung("a"), Rung("b")), (Comparison("b", "a", "b"),))
+    suite = AblationSuite("t", (Variant("a"), Variant("b")), (Comparison("b", "a", "b"),))
     request = RunRequest(fake_protocol(), "m", None)
     cell = Cell("c", request, None, "a")  # type: ignore[arg-type]
     ablation.write(
-        ladder, [(rung, CellOutcome(cell, read_result(folder))) for rung, folder in (("a", good), ("b", victim))]
+        suite, [(variant, CellOutcome(cell, read_result(folder))) for variant, folder in (("a", good), ("b", victim))]
     )
 
 
 def _borrow(runs: Path, good: Path, victim: Path) -> None:
     borrower, here = RunFolder.open(good), RunFolder.open(good).record.machine
-    other = lender(runs, borrower, "stage1", ["levels"], here)
+    other = reusable_run(runs, borrower, "stage1", ["levels"], here)
     if other is not None:
-        lend(other, borrower, "stage1")
+        reuse_state(other, borrower, "stage1")
 
 
 def _go_on(runs: Path, good: Path, victim: Path) -> None:

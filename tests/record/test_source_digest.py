@@ -20,7 +20,7 @@ from ihbench.files import atomic
 from ihbench.record import source_digest
 from ihbench.record.source_digest import bench_code, code_of, tree_digest
 from ihbench.record.store import RunFolder, RunIdentity
-from ihbench.runner.shared_states import lender
+from ihbench.runner.shared_states import reusable_run
 from ihbench.scene.protocol import load_protocol
 from ihbench.scoring.calibration import Calibration
 from tests.bench.test_house import imports
@@ -357,8 +357,8 @@ def test_no_state_is_taken_from_a_run_of_other_code(bench, mannequin):
     Ledger(folder).save_state("fit", {"x": np.zeros(1)}, {"step": 1})
     record = RunFolder.open(folder).record
     borrower, here = RunFolder(bench.runs / "new", record), record.machine
-    assert lender(bench.runs, borrower, "fit", (), here) is not None
+    assert reusable_run(bench.runs, borrower, "fit", (), here) is not None
     other = replace(record, identity=replace(record.identity, code=record.identity.code + "1"))
-    assert lender(bench.runs, RunFolder(bench.runs / "new", other), "fit", (), here) is None
+    assert reusable_run(bench.runs, RunFolder(bench.runs / "new", other), "fit", (), here) is None
     (folder / "checkpoints" / "fit.safetensors").write_bytes(b"")  # nor one that cannot be read
-    assert lender(bench.runs, borrower, "fit", (), here) is None
+    assert reusable_run(bench.runs, borrower, "fit", (), here) is None

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from ihbench.errors import BadInput
-from ihbench.methods.inpainthuman.studies.ladders import LADDERS
+from ihbench.methods.inpainthuman.studies.ablations import SUITES
 from ihbench.reports.paper.paper_numbers import Digits, paper_table
 from ihbench.scene.method_spec import method_spec
 
@@ -60,9 +60,9 @@ def test_numbers_that_are_written_elsewhere_too_are_the_same():
     reported = method_spec("inpainthuman").paper.reported
     assert [*reported["zju_mocap"].values(), *reported["ocmotion"].values()] == own
     rows = [[cell.value for cell in row.cells] for row in paper_table("table2").rows]
-    rungs = [rung.paper for rung in LADDERS["table2"].rungs if rung.paper]
-    assert rungs
-    assert all([paper["psnr"], paper["ssim"], paper["lpips"]] in rows for paper in rungs)
+    variants = [variant.paper for variant in SUITES["table2"].variants if variant.paper]
+    assert variants
+    assert all([paper["psnr"], paper["ssim"], paper["lpips"]] in rows for paper in variants)
 
 
 def test_columns_have_arrows_and_units():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ihbench.runner.ablation import Comparison, Ladder, Rung
+from ihbench.runner.ablation import AblationSuite, Comparison, Variant
 
 ONE_LEVEL: dict[str, Any] = {"levels": (128,)}  # the paper does not say which single map its baseline has
 NO_PAINTER: dict[str, Any] = {"inpaint.on": False}
@@ -26,21 +26,21 @@ ROWS = (
 )
 
 
-def _levels(*sides: int) -> Rung:
-    return Rung("+".join(map(str, sides)), {"levels": sides, **NO_PAINTER})
+def _levels(*sides: int) -> Variant:
+    return Variant("+".join(map(str, sides)), {"levels": sides, **NO_PAINTER})
 
 
-LADDERS = {
-    "table2": Ladder(
+SUITES = {
+    "table2": AblationSuite(
         "the paper's Table 2, in both readings of its first two rows",
         (
-            Rung("one level", ONE_LEVEL | NO_PAINTER, ROWS[0]),
-            Rung("MS", NO_PAINTER, ROWS[1]),
-            Rung("MS, one fit", ONE_FIT),
-            Rung("one level, diffusion", ONE_LEVEL | NEITHER, ROWS[0]),
-            Rung("MS, diffusion", NEITHER, ROWS[1]),
-            Rung("MS + TI", {"inpaint.sg": False}, ROWS[2]),
-            Rung("MS + TI + SG", {}, ROWS[3]),
+            Variant("one level", ONE_LEVEL | NO_PAINTER, ROWS[0]),
+            Variant("MS", NO_PAINTER, ROWS[1]),
+            Variant("MS, one fit", ONE_FIT),
+            Variant("one level, diffusion", ONE_LEVEL | NEITHER, ROWS[0]),
+            Variant("MS, diffusion", NEITHER, ROWS[1]),
+            Variant("MS + TI", {"inpaint.sg": False}, ROWS[2]),
+            Variant("MS + TI + SG", {}, ROWS[3]),
         ),
         (
             Comparison("multi-scale maps", "one level", "MS"),
@@ -55,12 +55,12 @@ LADDERS = {
         "The paper does not say whether diffusion is off in its first two rows or on without the word; the paper's "
         "numbers stand beside both.",
     ),
-    "plan": Ladder(
+    "plan": AblationSuite(
         "everything (hidden Gaussians, whole images, needless key views), against what the plan leaves for a scene",
-        (Rung("everything", EVERYTHING, keep=("all",)), Rung("planned")),
+        (Variant("everything", EVERYTHING, keep=("all",)), Variant("planned")),
         (Comparison("leaving out what the scene does not need", "everything", "planned"),),
     ),
-    "levels": Ladder(
+    "levels": AblationSuite(
         "levels of the UV feature maps, stage 1 alone",
         (_levels(64), _levels(64, 128), _levels(64, 128, 256), _levels(128), _levels(256)),
         (
@@ -70,21 +70,21 @@ LADDERS = {
             Comparison("three levels instead of 256", "256", "64+128+256"),
         ),
     ),
-    "fusion": Ladder(
+    "fusion": AblationSuite(
         "how levels are joined, stage 1 alone",
-        (Rung("sum", NO_PAINTER), Rung("concat", {"fusion": "concat", **NO_PAINTER})),
+        (Variant("sum", NO_PAINTER), Variant("concat", {"fusion": "concat", **NO_PAINTER})),
         (Comparison("concatenation instead of the sum", "sum", "concat"),),
     ),
-    "residual": Ladder(
+    "residual": AblationSuite(
         "the pose-dependent residual, stage 1 alone",
-        (Rung("without", {"pose_residual": False, **NO_PAINTER}), Rung("with", NO_PAINTER)),
+        (Variant("without", {"pose_residual": False, **NO_PAINTER}), Variant("with", NO_PAINTER)),
         (Comparison("the pose residual", "without", "with"),),
     ),
-    "rank": Ladder(
+    "rank": AblationSuite(
         "rank of LoRA on the painter",
         (
-            *(Rung(f"rank {r}", {"inpaint.tune": "lora", "inpaint.rank": r}) for r in (2, 8, 32)),
-            Rung("every weight", {"inpaint.tune": "all"}),
+            *(Variant(f"rank {r}", {"inpaint.tune": "lora", "inpaint.rank": r}) for r in (2, 8, 32)),
+            Variant("every weight", {"inpaint.tune": "all"}),
         ),
         (
             Comparison("rank 8 instead of 2", "rank 2", "rank 8"),
@@ -92,12 +92,12 @@ LADDERS = {
             Comparison("every weight instead of rank 8", "rank 8", "every weight"),
         ),
     ),
-    "painter": Ladder(
+    "painter": AblationSuite(
         "what paints hidden surface",
         (
-            Rung("nothing", NO_PAINTER),
-            *(Rung(name, {"inpaint.filler": name}) for name in ("push-pull", "mirror", "temporal")),
-            Rung("diffusion", {}),
+            Variant("nothing", NO_PAINTER),
+            *(Variant(name, {"inpaint.filler": name}) for name in ("push-pull", "mirror", "temporal")),
+            Variant("diffusion", {}),
         ),
         tuple(
             Comparison(f"diffusion instead of {name}", name, "diffusion")
