@@ -5,7 +5,7 @@ only build plain Python values and numpy arrays of numbers, text or objects. chu
 old SMPL files hold, come back as inert `ForeignObject`s that carry their state.
 
 Memory is bounded by the file's size: nothing is allocated that the file does not hold, and what shared references
-multiply is counted. A file that is made to be slow can still be that, or end the process; it cannot run anything.
+multiply is counted. So is the C stack: tuples nest only so deep. A file that is made to be slow can still be that.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ LARGEST = 4 * 2**30  # bytes of a file
 # what a file may grow to: honest ones share little, and stay far below
 BYTES, BYTES_A_FILE_BYTE = 2**20, 64
 VALUES, VALUES_A_FILE_BYTE = 10**6, 100
+DEEPEST = 100  # tuples in tuples
 
 
 class ForeignObject:
@@ -143,6 +144,7 @@ _INERT_PACKAGES = ("chumpy", "scipy.sparse")
 _LEAVES = (str, bytes, bytearray, int, float, complex, type(None), np.generic)
 _OPCODES = {opcode.code: opcode for opcode in pickletools.opcodes}
 _REFUSED = ("EXT1", "EXT2", "EXT4", "PERSID", "BINPERSID", "NEXT_BUFFER", "READONLY_BUFFER", "NEWOBJ_EX")
+_PUTS, _GETS = ("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"), ("GET", "BINGET", "LONG_BINGET")
 _LENGTHS = {  # how many bytes say how long an opcode's argument is
     pickletools.TAKEN_FROM_ARGUMENT1: 1,
     pickletools.TAKEN_FROM_ARGUMENT4: 4,
@@ -152,8 +154,10 @@ _LENGTHS = {  # how many bytes say how long an opcode's argument is
 
 
 def _check_opcodes(data: bytes) -> None:
-    """Refuse opcodes that no data file needs, and sizes and places that the file does not hold."""
+    """Refuse opcodes that no data file needs, sizes and places that the file does not hold, and deep tuples."""
     at = 0
+    depths: list[int] = []
+    memo: dict[int, int] = {}
     while data[at] != pickle.STOP[0]:
         opcode = _OPCODES[chr(data[at])]
         size = opcode.arg.n if opcode.arg else 0
@@ -168,11 +172,36 @@ def _check_opcodes(data: bytes) -> None:
             at = start + size
         if opcode.name in _REFUSED:
             raise pickle.UnpicklingError("refused: an opcode that no data file needs")
-        place = int(data[start:at]) if opcode.name == "PUT" else 0
-        if opcode.name == "LONG_BINPUT":
-            place = int.from_bytes(data[start:at], "little")
+        place = 0
+        if opcode.name in _PUTS or opcode.name in _GETS:
+            place = int(data[start:at]) if size < 0 else int.from_bytes(data[start:at], "little")
         if max(at, place) >= len(data):
             raise pickle.UnpicklingError("pickle data was truncated")
+        _nest(opcode, place, depths, memo)
+
+
+def _nest(opcode: pickletools.OpcodeInfo, place: int, depths: list[int], memo: dict[int, int]) -> None:
+    """Follow how deep the tuples on the stack are nested, -1 for a mark: as a key, a deep one ends the process, as
+    its hash recurses in C without a guard. Where the stack lacks what an opcode takes, the unpickler says so."""
+    name, before = opcode.name, opcode.stack_before
+    if name in _PUTS:
+        memo[len(memo) if name == "MEMOIZE" else place] = depths[-1]
+    elif name in _GETS:
+        depths.append(memo[place])
+    elif not before:
+        depths += [-1 if name == "MARK" else 0] * len(opcode.stack_after)
+    else:
+        taken = []
+        if pickletools.markobject in before:
+            while (depth := depths.pop()) >= 0:
+                taken.append(depth)
+            before = before[: before.index(pickletools.markobject)]
+            taken.append(0)
+        taken += [depths.pop() for _ in before]
+        depth = max(taken) + 1 if name.startswith("TUPLE") else max(taken[-1], 0)  # others give the lowest back
+        if depth > DEEPEST:
+            raise pickle.UnpicklingError(f"refused: tuples nested more than {DEEPEST} deep")
+        depths += [depth] * len(opcode.stack_after)
 
 
 def _as_bytes(data: object) -> bytes | bytearray:

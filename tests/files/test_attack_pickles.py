@@ -252,6 +252,11 @@ def bombs() -> dict[str, bytes]:
         "tuples": laughs + STOP,
         "tuples as a shape": laughs + KEY[0] + array(KEY[1], dtype("f8"), b(b"")) + STOP,
         "a deep tuple": b")" + b"\x85" * 150_000 + STOP,
+        "a deep tuple as a key": b"}" + b")" + b"\x85" * 10**6 + b"Ns" + STOP,  # its hash would end the process
+        "a deep tuple by the memo": b"}"
+        + (b")" + KEY[0] + (KEY[1] + b"\x85" + KEY[0] + b"0") * 10**5)
+        + b"Ns"
+        + STOP,
         "deep foreign objects": b"".join(
             (call(g("chumpy", "Ch")), (b"}" + s("x") + call(g("chumpy", "Ch"))) * 5000, b"sb" * 5000)
         )
