@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import numpy as np
 
@@ -30,37 +30,28 @@ if TYPE_CHECKING:
     from ihbench.scene.views import OccludedScene
 
 Choices = Mapping[str, Any] | None  # of the protocol, by name: {"image.edge": "soft"}
+Options = TypeVar("Options", bound=ProtocolChanges)
 Occlusion = str | Mapping[str, Any] | None  # a rule's name, or rule, fraction, covers as on the command line
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Arguments(ProtocolChanges):
-    """What every function takes."""
+class _SceneArguments(ProtocolChanges):
+    """One scene, and with defaults what only `run` takes."""
 
     protocol: str
-    profile: str | None
+    scene: str
+    profile: str
     data: Path | None
     body: Path | None
-    progress: Progress = field(default_factory=Progress)
+    method: str = ""
+    runs: Path = Path()
+    seed: Annotated[int, SEEDS] = 0
+    device: Literal["cpu", "cuda"] = "cpu"
+    force: bool = False
+    keep: tuple[str, ...] = ()
 
-    def chosen(self) -> Protocol:
-        """The protocol with its changes."""
-        return self.apply(load_protocol(self.protocol, self.profile or "quick"))[0]
-
-
-@dataclass(frozen=True, kw_only=True)
-class _SceneArguments(_Arguments):
-    scene: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class _RunArguments(_SceneArguments):
-    method: str
-    runs: Path
-    seed: Annotated[int, SEEDS]
-    device: Literal["cpu", "cuda"]
-    force: bool
-    keep: tuple[str, ...]
+    def changed_protocol(self) -> Protocol:
+        return self.apply(load_protocol(self.protocol, self.profile))[0]
 
 
 def run(
@@ -91,26 +82,23 @@ def run(
     "rule", "fraction" and "covers"; `choices` has any other choice of the protocol. Raises `BadInput` for anything
     the caller got wrong. Divergence and failure are statuses of the result.
     """
+    arguments = locals()
     for name, value in (("scene", scene), ("seed", seed)):
         if isinstance(value, list | tuple | set | range | np.ndarray) and np.ndim(list(value)):
             raise BadInput(f"{name} {shown(value)}: expected one; call ihbench.run for each, or ihbench.ablate")
-    given = _given(
-        _RunArguments,
-        dict(protocol=protocol, scene=scene, method=method, profile=profile, data=data, runs=runs, body=body,
-             seed=seed, device=device, force=force, keep=keep, progress=progress),
-        dict(image_size=image_size, train_frames=train_frames, test_frames=test_frames), occlusion, choices,
-    )  # fmt: skip
+    options, progress = _checked(_SceneArguments, arguments)
     from ihbench.runner.run_loop import RunRequest, configuration, run_scene
     from ihbench.scene.data_source import locate
 
-    check_device(given.device)
-    chosen = given.chosen()
-    config = configuration(given.method, chosen.profile, {name: _plain(value) for name, value in switches.items()})
-    check_keep(given.keep, config)
+    check_device(options.device)
+    changed = options.changed_protocol()
+    config = configuration(options.method, changed.profile, {name: _plain(v) for name, v in switches.items()})
+    check_keep(options.keep, config)
     request = RunRequest(
-        chosen, given.method, config, given.seed, given.device, given.runs, given.body, given.force, given.keep
-    )
-    return run_scene(request, locate(chosen, given.data, (given.scene,)), given.scene, given.progress)
+        changed, options.method, config, options.seed, options.device, options.runs, options.body, options.force,
+        options.keep,
+    )  # fmt: skip
+    return run_scene(request, locate(changed, options.data, (options.scene,)), options.scene, progress)
 
 
 def load_scene(
@@ -131,17 +119,14 @@ def load_scene(
 
     Frames and occlusion as in `run`. Raises `BadInput` for anything the caller got wrong.
     """
-    given = _given(
-        _SceneArguments,
-        dict(protocol=protocol, scene=scene, profile=profile, data=data, body=body, progress=progress),
-        dict(image_size=image_size, train_frames=train_frames, test_frames=test_frames), occlusion, choices,
-    )  # fmt: skip
+    options, progress = _checked(_SceneArguments, locals())
     from ihbench.scene.data_source import locate
     from ihbench.scene.views import open_scene
 
-    chosen = given.chosen()
-    capture, model = locate(chosen, given.data, (given.scene,)).open(given.scene, given.body, given.progress)
-    return open_scene(capture, chosen), model
+    changed = options.changed_protocol()
+    source = locate(changed, options.data, (options.scene,))
+    capture, model = source.open(options.scene, options.body, progress)
+    return open_scene(capture, changed), model
 
 
 @dataclass(frozen=True)
@@ -185,6 +170,7 @@ def ablate(
     In a script that starts workers, call it under `if __name__ == "__main__":`; `workers=0` starts none. Raises
     `BadInput` for anything the caller got wrong.
     """
+    arguments = locals() | {"scene": _several(scene), "seed": _several(seed), "vary": ()}
     from ihbench.commands.ablate import AblateOptions, ablated, write_out
     from ihbench.document.document import write
 
@@ -193,17 +179,10 @@ def ablate(
         if not isinstance(value, Mapping):
             raise BadInput(f"{name} {shown(value)}: expected a mapping from switches to values")
     values = {name: _several(value) for name, value in grids.items()}
-    given = _given(
-        AblateOptions,
-        dict(protocol=protocol, scene=_several(scene), method=method, profile=profile, data=data, runs=runs,
-             body=body, ladder=ladder, keep=keep, seed=_several(seed), device=device, workers=workers,
-             share=share, out=out),
-        dict(image_size=image_size, train_frames=train_frames, test_frames=test_frames), occlusion, choices,
-    )  # fmt: skip
-    told = _progress(progress)
+    options, progress = _checked(AblateOptions, arguments)
     fixed = {name: _plain(value) for name, value in (switches or {}).items()}
-    blocks, numbers, outcomes = ablated(given, values, fixed, told)
-    write_out(given, blocks, numbers)
+    blocks, numbers, outcomes = ablated(options, values, fixed, progress)
+    write_out(options, blocks, numbers)
     return Ablation(
         write(blocks, "md"),
         numbers,
@@ -240,36 +219,24 @@ def score(
     """
     from ihbench.commands.score import ScoreOptions, scored
 
-    given = _given(
-        ScoreOptions,
-        dict(predictions=predictions, protocol=protocol, scene=_several(scene), prepared=prepared, name=name,
-             pattern=pattern, alpha=alpha, profile=profile, data=data, runs=runs, body=body, force=force),
-        dict(image_size=image_size, train_frames=train_frames, test_frames=test_frames), occlusion, choices,
-    )  # fmt: skip
-    return scored(given, _progress(progress))
+    return scored(*_checked(ScoreOptions, locals() | {"scene": _several(scene)}))
 
 
-def _given(
-    kind: type[Any], values: dict[str, Any], changes: dict[str, Any], occlusion: Occlusion, choices: Choices
-) -> Any:
-    """The options, checked. Raises `BadInput` under the argument's own name."""
-    values, known = {**values, **changes}, {f.name: str(f.type) for f in fields(kind)}
-    if "progress" in values:
-        values["progress"] = _progress(values["progress"])
-    for name, value in values.items():
-        value = _plain(value)
-        if isinstance(value, str | os.PathLike):
-            value = user_path(value, name) if "Path" in known[name] else os.fspath(value)
-        values[name] = value
-    given = kind(**values, occlusion=_occlusion(occlusion), choices=_choices(choices))
-    check(given, "")
-    return given
-
-
-def _progress(progress: Any) -> Progress:
+def _checked(kind: type[Options], arguments: Mapping[str, Any]) -> tuple[Options, Progress]:
+    """A function's arguments as options, and its progress. Raises `BadInput` under the argument's own name."""
+    progress = arguments["progress"]
     if progress is not None and not isinstance(progress, Progress):
         raise BadInput(f"progress {shown(progress)}: expected an ihbench.clock.progress.Progress, or None")
-    return Progress() if progress is None else progress
+    special = {"occlusion": _occlusion, "choices": _choices}
+    values: dict[str, Any] = {}
+    for name, hint in ((f.name, str(f.type)) for f in fields(kind) if f.name in arguments):
+        value = special.get(name, _plain)(arguments[name])
+        if isinstance(value, str | os.PathLike):
+            value = user_path(value, name) if "Path" in hint else os.fspath(value)
+        values[name] = value
+    options = kind(**values)
+    check(options, "")
+    return options, progress or Progress()
 
 
 def _occlusion(value: Occlusion) -> OcclusionChoice:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import tyro
 
 from ihbench import registry
-from ihbench.commands.options.parse import options
+from ihbench.commands.options.parse import subcommand
 from ihbench.commands.options.printing import Printing
 from ihbench.config_fields import LARGEST_CAST, SEEDS, Within
 from ihbench.document.document import Block, Heading, Table
@@ -49,14 +49,10 @@ class Standin:
     """Profile of that protocol."""
 
 
-Command = (
-    Annotated[Check, tyro.conf.subcommand("check", description=Check.__doc__)]
-    | Annotated[Standin, tyro.conf.subcommand("standin", description=Standin.__doc__)]
-)
-
-
 def main(argv: list[str]) -> int:
-    chosen = options(Command, argv, "data", "Check a data folder, or write a stand-in capture.")  # type: ignore[arg-type]
+    chosen = subcommand(
+        {"check": Check, "standin": Standin}, argv, "data", "Check a data folder, or write a stand-in capture."
+    )
     return _check(chosen) if isinstance(chosen, Check) else _standin(chosen)
 
 

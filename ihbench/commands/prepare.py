@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ihbench.commands.options.parse import options
-from ihbench.commands.options.scene_choice import ProtocolChanges
+from ihbench.commands.options.scene_choice import OwnFiles, ProtocolChanges
 from ihbench.errors import BadInput
 
 OWN_LAYOUT = {
@@ -20,7 +20,7 @@ OWN_LAYOUT = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class PrepareOptions(ProtocolChanges):
+class PrepareOptions(ProtocolChanges, OwnFiles):
     protocol: str
     """A registered protocol (`ihbench list protocols`), or the path of a protocol file of your own (.toml)."""
     out: Path
@@ -31,14 +31,8 @@ class PrepareOptions(ProtocolChanges):
     """Scenes; none means all that the protocol names."""
     profile: str = "paper"
     """paper or quick: the size of the images, and which test views."""
-    data: Path | None = None
-    """Your copy of the data set; without it (and without IHBENCH_DATA) a stand-in."""
-    body: Path | None = None
-    """SMPL model file for real data (or IHBENCH_BODY)."""
     force: bool = False
     """Replace what an earlier call has written. A folder that holds anything else is left alone."""
-    json: bool = False
-    """Print one JSON object on stdout and nothing else there."""
 
 
 def main(argv: list[str]) -> int:

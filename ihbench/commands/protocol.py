@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from ihbench.commands.options.parse import options
+from ihbench.commands.options.parse import subcommand
 from ihbench.commands.options.printing import Printing
 from ihbench.commands.options.scene_choice import ProtocolChanges
 from ihbench.document.document import Table
@@ -35,14 +35,8 @@ class Diff(Printing):
     """Profile under which to compare them."""
 
 
-Command = (
-    Annotated[Show, tyro.conf.subcommand("show", description=Show.__doc__)]
-    | Annotated[Diff, tyro.conf.subcommand("diff", description=Diff.__doc__)]
-)
-
-
 def main(argv: list[str]) -> int:
-    chosen = options(Command, argv, "protocol", "Look at protocols.")  # type: ignore[arg-type]
+    chosen = subcommand({"show": Show, "diff": Diff}, argv, "protocol", "Look at protocols.")
     return _show(chosen) if isinstance(chosen, Show) else _diff(chosen)
 
 

@@ -14,6 +14,7 @@ import tyro
 
 from ihbench import registry
 from ihbench.commands.options.parse import options
+from ihbench.commands.options.run_filters import RunFilters
 from ihbench.errors import BadInput, visible
 from ihbench.files import atomic
 from ihbench.record import outputs
@@ -25,19 +26,9 @@ SHOWN = 20  # folders left out that are named on stderr
 
 
 @dataclass(frozen=True)
-class ReportOptions:
+class ReportOptions(RunFilters):
     run: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
     """Run folders; none means every run under --runs."""
-    runs: Path = Path("runs")
-    """Folder of run folders."""
-    protocol: str | None = None
-    """Only runs under this protocol, with or without its @version."""
-    method: str | None = None
-    """Only runs of this method."""
-    scene: str | None = None
-    """Only runs on this scene."""
-    profile: str | None = None
-    """Only runs under this profile."""
     preset: tuple[str, ...] = ()
     """Further metric presets to show (`ihbench list metrics`), such as gauhuman; stored renders are scored where they
     have not been yet."""

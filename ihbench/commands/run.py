@@ -13,7 +13,7 @@ from ihbench import registry
 from ihbench.commands.options.device import check_device
 from ihbench.commands.options.keep import check_keep
 from ihbench.commands.options.parse import options
-from ihbench.commands.options.scene_choice import SceneChoice
+from ihbench.commands.options.scene_choice import RunsFolder, SceneChoice
 from ihbench.commands.report import headline
 from ihbench.config_fields import SEEDS, refuse_repeated
 from ihbench.errors import BadInput
@@ -24,40 +24,30 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunOptions(SceneChoice):
-    seed: Annotated[tuple[int, ...], SEEDS] = (0,)
-    """Seeds; each is a run of its own."""
+class Fitting:
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to fit."""
-    keep: tuple[str, ...] = ()
-    """Switches that the plan must not change for this scene; "all" keeps everything."""
     force: bool = False
     """Run again even if the same run is done."""
     full: bool = False
     """Print the whole report in Markdown, and not the headline table alone."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(SceneChoice, Fitting):
+    seed: Annotated[tuple[int, ...], SEEDS] = (0,)
+    """Seeds; each is a run of its own."""
+    keep: tuple[str, ...] = ()
+    """Switches that the plan must not change for this scene; "all" keeps everything."""
     like: Path | None = None
     """Repeat the run in this folder, from its record: protocol, method, switches, scene and seed are its own. Beside
     it only --data, --body, --runs, --device, --force and --json."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class LikeOptions:
+class LikeOptions(RunsFolder, Fitting):
     like: Path
     """The folder of the run to repeat."""
-    data: Path | None = None
-    """Your copy of the data set, if the run used one (or IHBENCH_DATA)."""
-    body: Path | None = None
-    """SMPL model file for real data (or IHBENCH_BODY)."""
-    runs: Path = Path("runs")
-    """Where run folders lie."""
-    device: Literal["cpu", "cuda"] = "cpu"
-    """Where to fit."""
-    force: bool = False
-    """Run again even if the same run is done."""
-    full: bool = False
-    """Print the whole report in Markdown, and not the headline table alone."""
-    json: bool = False
-    """Print one JSON object on stdout and nothing else there."""
 
 
 def main(argv: list[str]) -> int:

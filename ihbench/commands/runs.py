@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from ihbench import registry
-from ihbench.commands.options.parse import options
+from ihbench.commands.options.parse import subcommand
 from ihbench.commands.options.printing import Printing
+from ihbench.commands.options.run_filters import RunFilters
 from ihbench.document.document import Table
 from ihbench.errors import BadInput
 
@@ -28,17 +29,7 @@ UNITS = ("B", "kB", "MB", "GB", "TB")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Filters(Printing):
-    runs: Path = Path("runs")
-    """Folder of run folders."""
-    protocol: str | None = None
-    """Only runs under this protocol, with or without its @version."""
-    scene: str | None = None
-    """Only runs on this scene."""
-    method: str | None = None
-    """Only runs of this method."""
-    profile: str | None = None
-    """Only runs under this profile."""
+class Filters(RunFilters, Printing):
     seed: int | None = None
     """Only runs with this seed."""
     status: str | None = None
@@ -60,14 +51,8 @@ class Remove(Filters):
     """Do not ask. Needed where nobody can be asked."""
 
 
-Command = (
-    Annotated[List, tyro.conf.subcommand("list", description=List.__doc__)]
-    | Annotated[Remove, tyro.conf.subcommand("rm", description=Remove.__doc__)]
-)
-
-
 def main(argv: list[str]) -> int:
-    chosen = options(Command, argv, "runs", "What a folder of runs holds; removing runs.")  # type: ignore[arg-type]
+    chosen = subcommand({"list": List, "rm": Remove}, argv, "runs", "What a folder of runs holds; removing runs.")
     return _remove(chosen) if isinstance(chosen, Remove) else _list(chosen)
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from ihbench import registry
 from ihbench.commands.options.parse import options
-from ihbench.commands.options.scene_choice import ProtocolChanges
+from ihbench.commands.options.scene_choice import ProtocolChanges, RunsFolder
 from ihbench.commands.report import headline
 from ihbench.errors import BadInput
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScoreOptions(ProtocolChanges):
+class ScoreOptions(ProtocolChanges, RunsFolder):
     protocol: str | None = None
     """A registered protocol (`ihbench list protocols`), or the path of a protocol file of your own (.toml)."""
     prepared: Path | None = None
@@ -44,18 +44,10 @@ class ScoreOptions(ProtocolChanges):
     """Scenes; none means all that the protocol names and the folder has images of."""
     profile: str | None = None
     """quick or paper: which views, in which size. By default the one whose image size the predictions have."""
-    data: Path | None = None
-    """Your copy of the data set; without it (and without IHBENCH_DATA) a stand-in."""
-    body: Path | None = None
-    """SMPL model file for real data (or IHBENCH_BODY)."""
-    runs: Path = Path("runs")
-    """Where run folders lie."""
     force: bool = False
     """Score again even if the same images have been."""
     full: bool = False
     """Print the whole report in Markdown, and not the headline table alone."""
-    json: bool = False
-    """Print one JSON object on stdout and nothing else there."""
 
 
 def main(argv: list[str]) -> int:

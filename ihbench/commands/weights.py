@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from ihbench.commands.options.parse import options
+from ihbench.commands.options.parse import subcommand
 from ihbench.commands.options.printing import Printing
 from ihbench.document.document import Paragraph, Table
 from ihbench.metrics import weights
@@ -31,15 +31,13 @@ class Fetch:
     """Names as `ihbench weights list` shows them."""
 
 
-Command = (
-    Annotated[List, tyro.conf.subcommand("list", description=List.__doc__)]
-    | Annotated[Where, tyro.conf.subcommand("where", description=Where.__doc__)]
-    | Annotated[Fetch, tyro.conf.subcommand("fetch", description=Fetch.__doc__)]
-)
-
-
 def main(argv: list[str]) -> int:
-    chosen = options(Command, argv, "weights", "Learned weights that the bench may not ship.")  # type: ignore[arg-type]
+    chosen = subcommand(
+        {"list": List, "where": Where, "fetch": Fetch},
+        argv,
+        "weights",
+        "Learned weights that the bench may not ship.",
+    )
     if isinstance(chosen, Fetch):
         return _fetch(chosen)
     states = weights.states()

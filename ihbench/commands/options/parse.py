@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import redirect_stderr
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, Union
 
 from ihbench import config_fields
 from ihbench.clock import streams
@@ -56,6 +56,14 @@ def options(kind: type[Options], argv: list[str], command: str, description: str
     _refuse_empty(chosen, argv)
     config_fields.check(chosen)
     return chosen
+
+
+def subcommand(kinds: Mapping[str, type], argv: list[str], command: str, description: str) -> Any:
+    """`options` of the one of several subcommands that is called; their docstrings are their help."""
+    import tyro
+
+    parts = [Annotated[kind, tyro.conf.subcommand(name, description=kind.__doc__)] for name, kind in kinds.items()]
+    return options(Union[tuple(parts)], argv, command, description)  # type: ignore[arg-type]  # noqa: UP007
 
 
 def _refuse_empty(chosen: Any, argv: list[str]) -> None:

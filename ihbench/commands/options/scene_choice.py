@@ -130,7 +130,23 @@ def _flag(choice: str) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneChoice(ProtocolChanges):
+class OwnFiles:
+    data: Path | None = None
+    """Your copy of the data set; without it (and without IHBENCH_DATA) a stand-in."""
+    body: Path | None = None
+    """SMPL model file for real data (or IHBENCH_BODY)."""
+    json: bool = False
+    """Print one JSON object on stdout and nothing else there."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunsFolder(OwnFiles):
+    runs: Path = Path("runs")
+    """Where run folders lie."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneChoice(ProtocolChanges, RunsFolder):
     protocol: str
     """A registered protocol (`ihbench list protocols`), or the path of a protocol file of your own (.toml)."""
     method: str = "inpainthuman"
@@ -139,11 +155,3 @@ class SceneChoice(ProtocolChanges):
     """Scenes; none means all that the protocol names."""
     profile: str = "quick"
     """quick (256 px, for a CPU) or paper (512 px, the paper's settings)."""
-    data: Path | None = None
-    """Your copy of the data set; without it (and without IHBENCH_DATA) a stand-in."""
-    body: Path | None = None
-    """SMPL model file for real data (or IHBENCH_BODY)."""
-    runs: Path = Path("runs")
-    """Where run folders lie."""
-    json: bool = False
-    """Print one JSON object on stdout and nothing else there."""

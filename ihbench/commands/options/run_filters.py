@@ -1,0 +1,20 @@
+"""The options that choose finished runs in a folder of runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunFilters:
+    runs: Path = Path("runs")
+    """Folder of run folders."""
+    protocol: str | None = None
+    """Only runs under this protocol, with or without its @version."""
+    method: str | None = None
+    """Only runs of this method."""
+    scene: str | None = None
+    """Only runs on this scene."""
+    profile: str | None = None
+    """Only runs under this profile."""
