@@ -16,8 +16,6 @@ from ihbench.datasets.people_snapshot import gaussianavatar, instantavatar
 from ihbench.datasets.zju_mocap import humannerf
 from ihbench.datasets.zju_mocap import original as zju_mocap
 from ihbench.datasets.zju_mocap import refine as zju_refine
-from ihbench.files import atomic
-from ihbench.files.pictures import encoded
 
 
 def zju(handout: Handout) -> Path:
@@ -28,8 +26,7 @@ def zju(handout: Handout) -> Path:
     for view in handout.views():
         zju_mocap.write_params(folder, view.number, view.body_pose, handout.body)
         zju_mocap.write_vertices(folder, view.number, handout.body.pose(view.body_pose))
-        _png(folder / paths[view.number], view.image)
-        zju_mocap.write_frame(folder, paths[view.number], mask=view.visible * np.uint8(255))
+        zju_mocap.write_frame(folder, paths[view.number], view.image, view.visible * np.uint8(255))
     return folder
 
 
@@ -41,9 +38,7 @@ def zju_refined(handout: Handout) -> Path:
     for view in handout.views():
         zju_mocap.write_params(folder, view.number, view.body_pose, handout.body, zju_refine.PARAMS)
         zju_mocap.write_vertices(folder, view.number, handout.body.pose(view.body_pose), zju_refine.PARAMS)
-        _png(folder / paths[view.number], view.image)
-        mask = folder / "mask" / "00" / f"{view.number:06d}.png"
-        _png(mask, view.visible * np.uint8(255))
+        zju_refine.write_frame(folder, paths[view.number], view.image, view.visible)
     return folder
 
 
@@ -87,7 +82,3 @@ def ocmotion(handout: Handout) -> Path:
     for view in handout.views():
         ocmotion_w2a.write_frame(folder, names[view.number], view.image, view.visible)
     return folder
-
-
-def _png(path: Path, picture: np.ndarray) -> None:
-    atomic.write_bytes(path, encoded(picture, "PNG", compress_level=3), durable=False)

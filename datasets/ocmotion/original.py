@@ -15,7 +15,6 @@ Source: boycehbz/CHOMP vis_OcMotion.py. What the `_w2a` sequences share with thi
 
 from __future__ import annotations
 
-import hashlib
 from abc import abstractmethod
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -32,12 +31,11 @@ from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera, off_orthogonal
 from ihbench.datasets.reading.capture_folder import CaptureFolder
 from ihbench.datasets.reading.pickles import write_pickle
-from ihbench.datasets.reading.stored_numbers import described, numbers
+from ihbench.datasets.reading.stored_numbers import described, numbers, stored_camera
 from ihbench.datasets.reading.subject_folders import SubjectFolders, View, count_files
 from ihbench.errors import BadInput
-from ihbench.files import atomic
 from ihbench.files.paths import user_path
-from ihbench.files.pictures import encoded, read_mask, read_rgb, size_of
+from ihbench.files.pictures import read_mask, read_rgb, size_of, write_picture
 from ihbench.files.safe_pickle import load_pickle
 from ihbench.registry import nearest
 from ihbench.scene.copy_report import SubjectReport
@@ -47,7 +45,6 @@ OneCapture = TypeVar("OneCapture", bound="OneCameraCapture")
 
 SPLITS = ("train", "test")
 SILHOUETTES = ("visible", "mask")  # two names of one thing
-JPEG_QUALITY = 95
 SAME_CAMERA = 1e-4  # largest difference between frames, relative to the largest entry of K, R and t
 FARTHEST = 100.0  # m from the origin: the scenes are rooms
 LARGEST_ROTATION = 4 * np.pi  # rad of one joint; a fit may wind once around, degrees go further
@@ -92,16 +89,9 @@ class OneCameraCapture(CaptureFolder):
         # OccFusion reads a palette's red
         return self.read_picture(path, camera, lambda path: read_mask(path, "first channel"), self._mask_hint)
 
-    def content_digest(self, camera: int, frame: int, source: str = "mask") -> bytes:
-        """Hash of the bytes of a frame's image and mask file; a missing or unreadable one counts as empty."""
-        digest = hashlib.sha256()
-        for path in (self.image_path(camera, frame), self.mask_path(camera, frame)):
-            try:
-                content = path.read_bytes()
-            except OSError:
-                content = b""
-            digest.update(f"{len(content)} ".encode() + content)
-        return digest.digest()
+    @staticmethod
+    def digest_prefix(size: int) -> bytes:
+        return f"{size} ".encode()
 
     def files_of(self, camera: int, frame: int, source: str) -> tuple[Path, ...]:
         return self.image_path(camera, frame), self.mask_path(camera, frame)
@@ -438,7 +428,7 @@ def write_annot(path: Path, sequences: Sequence[Sequence[Sequence[AnnotFrame]]])
 
 
 def _entry(frame: AnnotFrame) -> dict[str, Any]:
-    K, E = stored_camera(frame.camera)
+    K, E = stored_camera(frame.camera, "OcMotion")
     people = {
         key: {
             "bbox": np.array(person.bbox, np.float64),
@@ -464,27 +454,16 @@ def write_frame(
     """The picture files of one frame: the image as its name says (JPEG of quality 95, or PNG), the mask as 8-bit PNG
     of three channels, 0 and 255. None is not written."""
     if image is not None:
-        jpeg = PurePosixPath(img_path).suffix.lower() in (".jpg", ".jpeg")
-        options = {"quality": JPEG_QUALITY} if jpeg else {"compress_level": 3}
-        atomic.write_bytes(root / img_path, encoded(image, "JPEG" if jpeg else "PNG", **options), durable=False)
+        write_picture(root / img_path, image)
     if visible_mask is not None:
-        atomic.write_bytes(root / mask_file(img_path, suffix), mask_png(visible_mask), durable=False)
+        write_picture(root / mask_file(img_path, suffix), three_channels(visible_mask))
 
 
-def mask_png(mask: NDArray) -> bytes:
-    """A mask [H, W] as PNG of three equal channels, 255 where it is non-zero: OccFusion takes channel 0."""
-    grey = np.where(np.asarray(mask) != 0, 255, 0).astype(np.uint8)
-    return encoded(np.repeat(grey[..., None], 3, 2), "PNG", compress_level=3)
-
-
-def stored_camera(camera: Camera) -> tuple[Array, Array]:
-    """K [3, 3] px with integer pixel centres and E [4, 4] world to camera, m. Raises `ValueError` for a camera with
-    distortion, which OcMotion cannot keep."""
-    if camera.distortion is not None and camera.distortion.any():
-        raise ValueError("OcMotion: expected a camera without distortion")
-    E = np.eye(4)
-    E[:3, :3], E[:3, 3] = camera.R, camera.t
-    return camera.K_opencv, E
+def three_channels(
+    mask: NDArray,  # [H, W]
+) -> NDArray[np.uint8]:
+    """[H, W, 3], 255 where the mask is non-zero: OccFusion takes channel 0."""
+    return np.repeat((mask != 0)[..., None] * np.uint8(255), 3, 2)
 
 
 def ten_betas(body_pose: BodyPose) -> Array:

@@ -5,7 +5,6 @@
     metadata.json           {NNNNN: {cam_intrinsics [3, 3], cam_extrinsics [4, 4], poses 72, betas 10, trans 3}}
     mesh_infos.pkl          optional, HumanNeRF's; its Rh replaces the root in poses
     all_cameras.pkl         optional, {NNNNN: {intrinsics [6, 3, 3], extrinsics [6, 4, 4]}}
-    cameras.pkl, canonical_joints.pkl   written for OccNeRF, not read
 
 The camera is OpenCV's (integer pixel centres, world to camera, metres) without distortion, and fixed; vertices are
 SMPL(poses, betas) + trans in the world, standard root. Anything else in the folder is left alone.
@@ -31,18 +30,17 @@ from ihbench.datasets.ocmotion.original import (
     OneCameraCapture,
     Sequences,
     check_calibration,
-    mask_png,
     metric_pose,
     one_camera,
-    stored_camera,
     ten_betas,
+    three_channels,
 )
 from ihbench.datasets.reading.pickles import write_pickle
-from ihbench.datasets.reading.stored_numbers import described, numbers
+from ihbench.datasets.reading.stored_numbers import described, numbers, stored_camera
 from ihbench.datasets.reading.subject_folders import View
 from ihbench.errors import BadInput
 from ihbench.files import atomic
-from ihbench.files.pictures import encoded, one_line
+from ihbench.files.pictures import one_line, write_picture
 from ihbench.files.regular import read_text
 from ihbench.files.safe_pickle import load_pickle
 from ihbench.files.spelling import missing_file
@@ -264,7 +262,7 @@ def write_sequence_metadata(
     folder: Path, names: Sequence[str], camera: Camera, body_poses: Sequence[BodyPose]
 ) -> None:
     """metadata.json: one fixed camera without distortion and the body of every frame, exactly."""
-    K, E = stored_camera(camera)
+    K, E = stored_camera(camera, "OcMotion")
     content = {
         name: {
             "cam_intrinsics": K.tolist(),
@@ -287,10 +285,9 @@ def write_frame(
     """The picture files of one frame, both PNG, the mask with three equal channels of 0 and 255. None is not
     written."""
     if image is not None:
-        data = encoded(image, "PNG", compress_level=3)
-        atomic.write_bytes(folder / "images" / f"{name}.png", data, durable=False)
+        write_picture(folder / "images" / f"{name}.png", image)
     if visible_mask is not None:
-        atomic.write_bytes(folder / "masks" / f"{name}.png", mask_png(visible_mask), durable=False)
+        write_picture(folder / "masks" / f"{name}.png", three_channels(visible_mask))
 
 
 def write_mesh_infos(folder: Path, names: Sequence[str], body_poses: Sequence[BodyPose], body: Body) -> None:
@@ -298,7 +295,7 @@ def write_mesh_infos(folder: Path, names: Sequence[str], body_poses: Sequence[Bo
 
     Rh [3] is the root's rotation and poses [72] has zeros there; joints [24, 3] of that pose and tpose_joints [24, 3]
     are relative to the pelvis of the shaped T-pose; Th [3] is that pelvis, since the frame's translation goes into
-    the extrinsics of cameras.pkl (`write_cameras_pkl`). A point x of the pelvis-centred body is then R(Rh) x + Th in
+    the extrinsics of its cameras.pkl, E [I | trans]. A point x of the pelvis-centred body is then R(Rh) x + Th in
     the world of cameras.pkl. Of all this `W2aCapture` reads Rh only.
     """
     frames = {}
@@ -321,26 +318,7 @@ def write_mesh_infos(folder: Path, names: Sequence[str], body_poses: Sequence[Bo
 
 def write_all_cameras(folder: Path, names: Sequence[str], cameras: Sequence[Camera]) -> None:
     """all_cameras.pkl: at every frame the same cameras, translation not folded in, as OccFusion draws with them."""
-    stored = [stored_camera(camera) for camera in cameras]
+    stored = [stored_camera(camera, "OcMotion") for camera in cameras]
     K, E = np.stack([K for K, _ in stored]), np.stack([E for _, E in stored])
     frames = {name: {"intrinsics": K.copy(), "extrinsics": E.copy()} for name in names}
     write_pickle(folder / "all_cameras.pkl", frames)
-
-
-def write_cameras_pkl(folder: Path, names: Sequence[str], camera: Camera, body_poses: Sequence[BodyPose]) -> None:
-    """cameras.pkl for OccNeRF: the camera with each frame's translation folded in, E <- E [I | trans]."""
-    K, E = stored_camera(camera)
-    frames = {}
-    for name, body_pose in zip(names, body_poses, strict=True):
-        moved = np.eye(4)
-        moved[:3, 3] = body_pose.transl
-        frames[name] = {"intrinsics": K.copy(), "extrinsics": E @ moved}
-    write_pickle(folder / "cameras.pkl", frames)
-
-
-def write_canonical_joints(folder: Path, joints: NDArray[np.floating]) -> None:
-    """canonical_joints.pkl for OccNeRF: the T-pose's joints [24, 3] m of the average shape."""
-    joints = np.array(joints, np.float64)
-    if joints.shape != (24, 3):
-        raise ValueError(f"canonical joints: expected shape [24, 3], got {list(joints.shape)}")
-    write_pickle(folder / "canonical_joints.pkl", {"joints": joints})

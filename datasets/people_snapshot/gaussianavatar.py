@@ -33,10 +33,12 @@ from ihbench.datasets.people_snapshot.original import (
     rigid_extrinsic,
     stacked,
 )
+from ihbench.datasets.reading.stored_numbers import stored_camera
 from ihbench.datasets.reading.subject_folders import SubjectFolders, View, count_files
 from ihbench.errors import BadInput
 from ihbench.files import atomic
-from ihbench.files.pictures import encoded, read_mask, size_of
+from ihbench.files.npz import write_npz
+from ihbench.files.pictures import read_mask, size_of, write_picture
 from ihbench.files.spelling import missing_file
 from ihbench.files.tensors import read_tensors
 from ihbench.scene.copy_report import SubjectReport
@@ -243,19 +245,10 @@ def read_poses(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], ND
 # ----------------------------------------------------------------------------------------------- write
 
 
-def image_stem(frame: int) -> str:
-    return f"{frame:06d}"
-
-
 def write_camera(folder: Path, split: str, camera: Camera) -> None:
     """The split's cam_parms.npz. Lossless, but for distortion, which this layout lacks: `ValueError`."""
-    if camera.distortion is not None and camera.distortion.any():
-        raise ValueError("GaussianAvatar camera: expected a camera without distortion, undistort the images first")
-    extrinsic = np.eye(4)
-    extrinsic[:3, :3], extrinsic[:3, 3] = camera.R, camera.t
-    buffer = io.BytesIO()
-    np.savez(buffer, intrinsic=camera.K_opencv, extrinsic=extrinsic)
-    atomic.write_bytes(_split(folder, split) / f"{CAMERA}.npz", buffer.getvalue(), durable=False)
+    K, E = stored_camera(camera, "GaussianAvatar")
+    write_npz(_split(folder, split) / f"{CAMERA}.npz", {"intrinsic": K, "extrinsic": E}, durable=False)
 
 
 def write_frame(
@@ -268,8 +261,7 @@ def write_frame(
     """The frame's image and mask as PNG. Lossless."""
     label = np.where(mask != 0, 255, 0).astype(np.uint8)
     for kind, picture in ((IMAGES, image), (MASKS, label)):
-        path = _split(folder, split) / kind / f"{image_stem(frame)}.png"
-        atomic.write_bytes(path, encoded(picture, "PNG", compress_level=3), durable=False)
+        write_picture(_split(folder, split) / kind / f"{frame:06d}.png", picture)
 
 
 def write_poses(folder: Path, split: str, poses: Sequence[BodyPose]) -> None:

@@ -17,7 +17,6 @@ import io
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,10 +34,12 @@ from ihbench.datasets.people_snapshot.original import (
     rigid_extrinsic,
     stacked,
 )
+from ihbench.datasets.reading.stored_numbers import stored_camera
 from ihbench.datasets.reading.subject_folders import SubjectFolders, View, count_files
 from ihbench.errors import BadInput
 from ihbench.files import atomic
-from ihbench.files.pictures import above_half, encoded
+from ihbench.files.npz import write_npz
+from ihbench.files.pictures import above_half, write_picture
 from ihbench.files.safe_pickle import load_npy
 from ihbench.scene.copy_report import SubjectReport
 
@@ -249,33 +250,26 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
 
 def write_camera(folder: Path, camera: Camera) -> None:
     """cameras.npz. Lossless, but for distortion, which this layout lacks: `ValueError`."""
-    if camera.distortion is not None and camera.distortion.any():
-        raise ValueError("InstantAvatar camera: expected a camera without distortion, undistort the images first")
-    extrinsic = np.eye(4)
-    extrinsic[:3, :3], extrinsic[:3, 3] = camera.R, camera.t
-    _write_npz(
-        folder / CAMERA_FILE,
-        intrinsic=camera.K_opencv,
-        extrinsic=extrinsic,
-        height=np.array(camera.height),
-        width=np.array(camera.width),
-    )
+    K, E = stored_camera(camera, "InstantAvatar")
+    size = {"height": np.array(camera.height), "width": np.array(camera.width)}
+    write_npz(folder / CAMERA_FILE, {"intrinsic": K, "extrinsic": E, **size}, durable=False)
 
 
 def write_poses(folder: Path, poses: Sequence[BodyPose]) -> None:
     """poses.npz, float32 (1e-6 rad and m): a pose for each frame from 0. `ValueError` when the betas differ."""
-    thetas, transl, betas = stacked(poses)
-    _write_npz(folder / POSES_FILE, betas=betas, thetas=thetas, transl=transl)
+    write_npz(folder / POSES_FILE, _named(poses), durable=False)
 
 
 def write_refined(folder: Path, split: str, frames: Sequence[int], poses: Sequence[BodyPose]) -> None:
     """poses/anim_nerf_<split>.npz with the frames it refines, float32. `split` is "train" or "test"."""
     if len(frames) != len(poses):
         raise ValueError(f"refined poses: expected one for each of {len(frames)} frames, got {len(poses)}")
+    write_npz(folder / REFINED[split], {**_named(poses), "frames": np.asarray(frames, np.int64)}, durable=False)
+
+
+def _named(poses: Sequence[BodyPose]) -> dict[str, NDArray]:
     thetas, transl, betas = stacked(poses)
-    _write_npz(
-        folder / REFINED[split], betas=betas, thetas=thetas, transl=transl, frames=np.asarray(frames, np.int64)
-    )
+    return {"betas": betas, "thetas": thetas, "transl": transl}
 
 
 def write_frame(
@@ -286,15 +280,8 @@ def write_frame(
 ) -> None:
     """The frame's image as PNG and its mask as uint8 0/1. Lossless. None is not written."""
     if image is not None:
-        path = folder / "images" / f"image_{frame:04d}.png"
-        atomic.write_bytes(path, encoded(image, "PNG", compress_level=3), durable=False)
+        write_picture(folder / "images" / f"image_{frame:04d}.png", image)
     if mask is not None:
         buffer = io.BytesIO()
         np.save(buffer, (mask != 0).astype(np.uint8))
         atomic.write_bytes(folder / "masks" / f"mask_{frame:04d}.npy", buffer.getvalue(), durable=False)
-
-
-def _write_npz(path: Path, **arrays: Any) -> None:
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
-    atomic.write_bytes(path, buffer.getvalue(), durable=False)

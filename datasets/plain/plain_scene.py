@@ -11,9 +11,7 @@ scene.json                     optional: {"name": …, "about": …}
 from __future__ import annotations
 
 import hashlib
-import io
 import re
-import tempfile
 import unicodedata
 import zlib
 from collections.abc import Callable, Mapping, Sequence
@@ -37,8 +35,8 @@ from ihbench.datasets.reading.stored_numbers import numbers
 from ihbench.datasets.reading.subject_folders import SubjectFolders, View
 from ihbench.errors import BadInput, BadValue
 from ihbench.files import atomic
-from ihbench.files.npz import read_npz
-from ihbench.files.pictures import encoded, one_line, read_mask, read_rgb
+from ihbench.files.npz import read_npz, write_npz
+from ihbench.files.pictures import one_line, read_mask, read_rgb, write_picture
 from ihbench.files.spelling import as_stored, missing_file, same_name
 from ihbench.registry import nearest
 from ihbench.scene.copy_report import SubjectReport
@@ -51,7 +49,6 @@ CAMERA_KEYS = ("K", "R", "t", "width", "height", "distortion", "pixel_center")
 POSE_KEYS = ("frames", "pose", "betas", "transl", "root")
 ROOTS = ("smpl", "zju")
 LARGEST_POSES = 2**28  # bytes of one array in poses.npz: 460 000 frames
-JPEG_QUALITY = 95
 SMPL_PELVIS = (0.0, -0.24, 0.03)  # m, about, in SMPL's rest pose; only `check` uses it
 
 
@@ -534,9 +531,7 @@ def write_poses(
     }
     if len(arrays["frames"]) != len(pose):
         raise ValueError(f"poses: expected {len(pose)} frame numbers, got {len(arrays['frames'])}")
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
-    atomic.write_bytes(Path(folder) / POSES_FILE, buffer.getvalue())
+    write_npz(Path(folder) / POSES_FILE, arrays)
 
 
 def write_frame(
@@ -556,16 +551,12 @@ def write_frame(
     image, mask = as_array(image), as_mask(mask)
     subfolder = camera_id or "."
     if image is not None:
-        as_png = ending == "png"
-        data = encoded(image, "PNG", compress_level=3) if as_png else encoded(image, "JPEG", quality=JPEG_QUALITY)
         if mask is not None and mask.shape != image.shape[:2]:
             sizes = f"{list(image.shape[:2])} like the image, got {list(mask.shape)}"
             raise BadValue(f"frame {number}: expected a mask {sizes}")
-        atomic.write_bytes(place / "images" / subfolder / f"{number:06d}.{ending}", data, durable=False)
+        write_picture(place / "images" / subfolder / f"{number:06d}.{ending}", image)
     if mask is not None:
-        labels = np.where(mask != 0, 255, 0).astype(np.uint8)
-        path = place / "masks" / subfolder / f"{number:06d}.png"
-        atomic.write_bytes(path, encoded(labels, "PNG", compress_level=3), durable=False)
+        write_picture(place / "masks" / subfolder / f"{number:06d}.png", (mask != 0) * np.uint8(255))
 
 
 def as_array(picture: Any) -> NDArray | None:
@@ -597,10 +588,7 @@ def as_mask(mask: Any) -> NDArray | None:
 
 def write_body_file(folder: Path, body: Body) -> None:
     """body.npz, the body that the poses belong to; `PlainCapture.model` reads it."""
-    with tempfile.TemporaryDirectory() as spare:
-        path = Path(spare) / BODY_FILE
-        write_body(path, body)
-        atomic.write_bytes(Path(folder) / BODY_FILE, path.read_bytes())
+    write_body(Path(folder) / BODY_FILE, body)
 
 
 def write_about(folder: Path, name: str, about: str = "") -> None:

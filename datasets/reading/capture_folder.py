@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import cached_property
@@ -77,8 +78,29 @@ class CaptureFolder(ABC):
             return True
 
     def files_of(self, camera: int, frame: int, source: str) -> tuple[Path, ...]:
-        """The picture files of one view. Formats whose frames share files have none."""
+        """The picture files of one view. Formats whose frames share files have none. Raises `BadInput`."""
         return ()
+
+    def content_digest(self, camera: int, frame: int, source: str = "mask") -> bytes:
+        """Hash of the bytes of one view's image and mask files; a missing or unreadable file counts as empty."""
+        self.check_index(camera, frame)
+        digest = hashlib.sha256()
+        try:
+            paths = self.files_of(camera, frame, source)
+        except BadInput:  # the copy does not list it
+            paths = ()
+        for path in paths:
+            try:
+                content = path.read_bytes() if path.is_file() else b""
+            except OSError:
+                content = b""
+            digest.update(self.digest_prefix(len(content)) + content)
+        return digest.digest()
+
+    @staticmethod
+    def digest_prefix(size: int) -> bytes:
+        """What stands in a digest before a file of this size."""
+        return b""
 
     @abstractmethod
     def camera(self, camera: int) -> Camera: ...

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ihbench.camera import Camera
 from ihbench.datasets.reading.capture_folder import BY_OPTIONS
 from ihbench.errors import BadInput
 
@@ -51,3 +52,16 @@ def described(value: object) -> str:
     if isinstance(value, np.ndarray):
         return f"a {value.dtype} array of shape {list(value.shape)}"
     return f"a {type(value).__name__}"
+
+
+def extrinsic(camera: Camera) -> NDArray[np.float64]:
+    """[4, 4] world to camera, m."""
+    return np.block([[camera.R, camera.t[:, None]], [np.zeros(3), 1.0]])
+
+
+def stored_camera(camera: Camera, layout: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """K [3, 3] px with integer pixel centres and E [4, 4] world to camera, m. Raises `ValueError` for a camera with
+    distortion, which the layout cannot keep."""
+    if camera.distortion is not None and camera.distortion.any():
+        raise ValueError(f"{layout} camera: expected a camera without distortion, undistort the images first")
+    return camera.K_opencv, extrinsic(camera)

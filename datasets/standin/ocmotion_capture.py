@@ -20,7 +20,7 @@ from ihbench.datasets.standin.furniture import furnish, furniture_view
 from ihbench.datasets.standin.studio import empty_studio
 from ihbench.datasets.standin.subject import Subject
 from ihbench.files import atomic
-from ihbench.files.pictures import encoded
+from ihbench.files.pictures import encoded, write_picture
 
 N_FRAMES = 100
 N_CAMERAS = 6  # of the rig; the images are of the first
@@ -64,8 +64,7 @@ class OcMotionStandIn(StandIn):
             before = furniture.depth < shot.depth
             image = np.where(before[..., None], furniture.image, shot.image)
             ocmotion_w2a.write_frame(folder, names[k], image, shot.mask & ~before)
-            whole = encoded(shot.image, "JPEG", quality=95)
-            atomic.write_bytes(folder / "truth" / "images" / f"{names[k]}.jpg", whole, durable=False)
+            write_picture(folder / "truth" / "images" / f"{names[k]}.jpg", shot.image)
             silhouette = encoded(shot.mask.astype(np.uint8) * 255, "PNG")
             atomic.write_bytes(folder / "truth" / "masks" / f"{names[k]}.png", silhouette, durable=False)  # is last
 

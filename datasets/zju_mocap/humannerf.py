@@ -12,7 +12,6 @@ Not every copy holds betas: then they follow from tpose_joints, which are linear
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections.abc import Callable, Mapping
 from functools import cached_property
@@ -27,11 +26,10 @@ from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.datasets.reading.capture_folder import CaptureFolder, Picture
 from ihbench.datasets.reading.pickles import write_pickle
-from ihbench.datasets.reading.stored_numbers import described, numbers
+from ihbench.datasets.reading.stored_numbers import described, extrinsic, numbers
 from ihbench.datasets.reading.subject_folders import SubjectFolders, View, count_files
 from ihbench.errors import BadInput
-from ihbench.files import atomic
-from ihbench.files.pictures import encoded, read_mask, read_rgb, size_of
+from ihbench.files.pictures import read_mask, read_rgb, size_of, write_picture
 from ihbench.files.safe_pickle import load_pickle
 from ihbench.scene.copy_report import SubjectReport
 
@@ -156,13 +154,6 @@ class HumanNerfCapture(CaptureFolder):
             raise BadInput(f"{self.folder}: silhouette source {source!r}: this layout has joined masks only")
         return self._read("masks", camera, frame, lambda path: read_mask(path, "half"))
 
-    def content_digest(self, camera: int, frame: int, source: str = "mask") -> bytes:
-        digest = hashlib.sha256()
-        if (self.camera_ids[camera], frame) in self._names:
-            for path in self.files_of(camera, frame, source):
-                digest.update(path.read_bytes() if path.is_file() else b"")
-        return digest.digest()
-
     def files_of(self, camera: int, frame: int, source: str) -> tuple[Path, ...]:
         return self.picture("images", camera, frame), self.picture("masks", camera, frame)
 
@@ -212,10 +203,8 @@ def write_pickles(
     """cameras.pkl, mesh_infos.pkl and canonical_joints.pkl; the reader undoes them to 1e-12."""
     cameras, infos = {}, {}
     for name, (camera, body_pose) in views.items():
-        E = np.eye(4)
-        E[:3, :3], E[:3, 3] = camera.R, camera.t
         lens = np.zeros(5) if camera.distortion is None else camera.distortion.copy()
-        cameras[name] = {"intrinsics": camera.K_opencv, "extrinsics": E, "distortions": lens}
+        cameras[name] = {"intrinsics": camera.K_opencv, "extrinsics": extrinsic(camera), "distortions": lens}
         Rh, Th = zju_root(body_pose, body)
         poses = body_pose.pose.copy()
         poses[0] = 0
@@ -240,6 +229,5 @@ def write_pickles(
 
 def write_view(folder: Path, name: str, image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> None:
     """The PNG files of one view: image [H, W, 3] RGB, mask [H, W] in three channels of 0 or 255. Lossless."""
-    atomic.write_bytes(folder / "images" / f"{name}.png", encoded(image, "PNG", compress_level=3), durable=False)
-    three = np.repeat(mask.astype(np.uint8)[..., None] * 255, 3, axis=2)
-    atomic.write_bytes(folder / "masks" / f"{name}.png", encoded(three, "PNG", compress_level=3), durable=False)
+    write_picture(folder / "images" / f"{name}.png", image)
+    write_picture(folder / "masks" / f"{name}.png", np.repeat(mask[..., None] * np.uint8(255), 3, 2))

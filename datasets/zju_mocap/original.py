@@ -12,7 +12,6 @@ tools/prepare_zju_mocap. Parameter files are numbered as the images are, which i
 
 from __future__ import annotations
 
-import hashlib
 import io
 import re
 from collections.abc import Callable, Sequence
@@ -33,7 +32,7 @@ from ihbench.datasets.reading.stored_numbers import described, numbers
 from ihbench.datasets.reading.subject_folders import SubjectFolders, View, count_files
 from ihbench.errors import BadInput
 from ihbench.files import atomic
-from ihbench.files.pictures import encoded, read_mask, read_rgb, size_of
+from ihbench.files.pictures import read_mask, read_rgb, size_of, write_picture
 from ihbench.files.safe_pickle import load_npy
 from ihbench.files.spelling import missing_file
 from ihbench.registry import nearest
@@ -43,7 +42,6 @@ FOLDER_PREFIX = "CoreView_"
 FITS = ("new_params", "params")  # the newer one first: HumanNeRF and OccNeRF use it
 SILHOUETTES = {"mask": ("mask",), "mask_cihp": ("mask_cihp",), "union": ("mask", "mask_cihp")}
 CAMERA_SHAPES = {"K": (3, 3), "D": (5,), "R": (3, 3), "T": (3,)}
-JPEG_QUALITY = 95
 
 
 class ZjuMocap(SubjectFolders["ZjuCapture"]):
@@ -158,14 +156,6 @@ class ZjuCapture(CaptureFolder):
             person = here if person is None else person | here
         assert person is not None
         return person
-
-    def content_digest(self, camera: int, frame: int, source: str = "mask") -> bytes:
-        """Hash of the bytes of one view's image and mask files; a missing file counts as empty."""
-        kinds = SILHOUETTES.get(source, ())
-        digest = hashlib.sha256()
-        for path in (self.image_path(camera, frame), *(self.mask_path(camera, frame, kind) for kind in kinds)):
-            digest.update(path.read_bytes() if path.is_file() else b"")
-        return digest.digest()
 
     def files_of(self, camera: int, frame: int, source: str) -> tuple[Path, ...]:
         masks = (self.mask_path(camera, frame, kind) for kind in SILHOUETTES.get(source, ()))
@@ -358,13 +348,12 @@ def write_frame(
     mask: NDArray | None = None,  # [H, W] non-zero = person
     mask_cihp: NDArray[np.uint8] | None = None,  # [H, W] CIHP part labels
 ) -> None:
-    """The picture files of one camera at one frame: JPEG of quality 95, masks as 8-bit PNG. None is not written."""
+    """The pictures of one camera at one frame: the image by its ending, masks as 8-bit PNG. None is not written."""
     if image is not None:
-        atomic.write_bytes(folder / image_path, encoded(image, "JPEG", quality=JPEG_QUALITY), durable=False)
+        write_picture(folder / image_path, image)
     for kind, labels in (("mask", mask), ("mask_cihp", mask_cihp)):
         if labels is not None:
-            path = folder / kind / PurePosixPath(image_path).with_suffix(".png")
-            atomic.write_bytes(path, encoded(labels.astype(np.uint8), "PNG", compress_level=3), durable=False)
+            write_picture((folder / kind / image_path).with_suffix(".png"), labels.astype(np.uint8))
 
 
 def write_params(folder: Path, number: int, body_pose: BodyPose, body: Body, fit: str = "new_params") -> None:

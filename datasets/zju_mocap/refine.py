@@ -21,8 +21,7 @@ from ihbench.body import Body
 from ihbench.datasets.zju_mocap import original as zju_mocap
 from ihbench.datasets.zju_mocap.original import ZjuCapture, ZjuMocap
 from ihbench.errors import BadInput
-from ihbench.files import atomic
-from ihbench.files.pictures import encoded
+from ihbench.files.pictures import write_picture
 
 PREFIX = "my_"
 PARAMS = "smpl_params"
@@ -80,4 +79,4 @@ def write_frame(folder: Path, image_path: str, image: NDArray[np.uint8], mask: N
     """The picture files of one camera at one frame; `image_path` as annots.npy lists it, with images/ in front."""
     zju_mocap.write_frame(folder, image_path, image)
     path = folder / "mask" / PurePosixPath(image_path).relative_to("images").with_suffix(".png")
-    atomic.write_bytes(path, encoded(mask.astype(np.uint8) * 255, "PNG", compress_level=3), durable=False)
+    write_picture(path, mask.astype(np.uint8) * 255)

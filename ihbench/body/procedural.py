@@ -12,7 +12,6 @@ follow the shape coefficients.
 
 from __future__ import annotations
 
-import io
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +22,7 @@ from numpy.typing import NDArray
 from ihbench.body.atlas import part_atlas
 from ihbench.body.procedural_surface import build_mesh
 from ihbench.body.skeleton import JOINT_INDEX, JOINT_NAMES, PARENTS
-from ihbench.files import atomic
+from ihbench.files.npz import write_npz
 
 Array = NDArray[np.float64]
 
@@ -272,11 +271,9 @@ def main(arguments: list[str]) -> int:
         return 2
     out = Path(arguments[0])
     arrays = build_body()
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)  # pyright: ignore[reportArgumentType]
-    atomic.write_bytes(out, buffer.getvalue())
+    write_npz(out, arrays, compressed=True)
     V, F = len(arrays["v_template"]), len(arrays["f"])
-    print(f"{out}: {V} vertices, {F} faces, Euler characteristic {V - F // 2}, {len(buffer.getvalue()) / 1e6:.3f} MB")
+    print(f"{out}: {V} vertices, {F} faces, Euler characteristic {V - F // 2}, {out.stat().st_size / 1e6:.3f} MB")
     return 0
 
 

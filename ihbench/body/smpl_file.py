@@ -6,7 +6,6 @@ vchoutas/smplx smplx/body_models.py and SMPL's release notes.
 
 from __future__ import annotations
 
-import io
 import re
 from functools import cache
 from pathlib import Path
@@ -20,8 +19,7 @@ from ihbench.body.model import Body
 from ihbench.body.skeleton import PARENTS
 from ihbench.body.uv_obj import read_uv_obj
 from ihbench.errors import BadInput
-from ihbench.files import atomic
-from ihbench.files.npz import read_npz
+from ihbench.files.npz import read_npz, write_npz
 from ihbench.files.paths import user_path
 from ihbench.files.safe_pickle import ForeignObject, load_pickle
 
@@ -249,6 +247,4 @@ def write_body(path: str | Path, body: Body) -> None:
         arrays["posedirs"] = body.posedirs
     if body.face_landmarks is not None:
         arrays["face_landmarks"] = body.face_landmarks
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)
-    atomic.write_bytes(Path(path), buffer.getvalue())
+    write_npz(path, arrays, compressed=True)

@@ -1,7 +1,8 @@
-"""Read `.npz` files of plain arrays: nothing in them runs, and a small file cannot claim or unpack to a huge one."""
+"""`.npz` files of plain arrays: nothing in them runs, and a small file cannot claim or unpack to a huge one."""
 
 from __future__ import annotations
 
+import io
 import math
 import zipfile
 from collections.abc import Collection
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.errors import BadInput
+from ihbench.files import atomic
 from ihbench.files.regular import opened
 from ihbench.files.safe_pickle import read_npy_header
 
@@ -48,6 +50,15 @@ def read_npz(path: str | Path, names: Collection[str] | None = None, largest: in
                 f"{path}: cannot be read as a .npz of plain arrays ({reason}); copy or write the file again"
             ) from None
     return arrays
+
+
+def write_npz(
+    path: str | Path, arrays: dict[str, NDArray], *, durable: bool = True, compressed: bool = False
+) -> None:
+    """Write the arrays by name, the file whole or not at all (`atomic.write_bytes`)."""
+    buffer = io.BytesIO()
+    (np.savez_compressed if compressed else np.savez)(buffer, **arrays)  # pyright: ignore[reportArgumentType]
+    atomic.write_bytes(Path(path), buffer.getvalue(), durable)
 
 
 def _array(member: IO[bytes], where: str, largest: int) -> NDArray:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.errors import BadInput, BadValue
+from ihbench.files import atomic
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -30,6 +31,7 @@ WIDE = {9: "BT.2020", 11: "DCI-P3", 12: "Display P3"}  # primaries, by their num
 HIGH_RANGE = {8: "linear light", 16: "HDR (PQ)", 18: "HDR (HLG)"}  # transfer functions, likewise
 SAME_COLOUR = 12  # levels by which a profile that calls itself sRGB, or a gamma of 2.2, may differ from it
 SOME = 0.01  # share of pixels that say nothing: renderers clip colours beyond white
+JPEG_QUALITY = 95
 TWELVE_BITS = 4095  # a picture as dark as that in 16 bits holds fewer
 ORIENTATION = 0x0112  # the EXIF tag
 WHITE_IS_ZERO, SAMPLE_FORMAT = 262, 339  # TIFF tags
@@ -224,6 +226,13 @@ def encoded(picture: NDArray[np.uint8], kind: str, **options: int) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(picture).save(buffer, kind, **options)
     return buffer.getvalue()
+
+
+def write_picture(path: Path, picture: NDArray[np.uint8]) -> None:
+    """A picture file of a data set by its name's ending: JPEG of quality 95, else PNG."""
+    jpeg = path.suffix.lower() in (".jpg", ".jpeg")
+    data = encoded(picture, "JPEG", quality=JPEG_QUALITY) if jpeg else encoded(picture, "PNG", compress_level=3)
+    atomic.write_bytes(path, data, durable=False)
 
 
 def one_line(error: object) -> str:

@@ -21,6 +21,7 @@ from ihbench.datasets.ocmotion import original as ocmotion
 from ihbench.datasets.ocmotion import wild2avatar as ocmotion_w2a
 from ihbench.datasets.ocmotion.original import AnnotFrame, AnnotPerson, OcMotionOriginal
 from ihbench.datasets.ocmotion.wild2avatar import OcMotionW2a
+from ihbench.datasets.reading.stored_numbers import stored_camera
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.render.zbuffer import rasterize
@@ -91,8 +92,6 @@ def write_w2a(root: Path, body, name: str = NAME) -> Written:
     ocmotion_w2a.write_sequence_metadata(folder, NAMES, cameras[OWN], poses)
     ocmotion_w2a.write_mesh_infos(folder, NAMES, poses, body)
     ocmotion_w2a.write_all_cameras(folder, NAMES, cameras)
-    ocmotion_w2a.write_cameras_pkl(folder, NAMES, cameras[OWN], poses)
-    ocmotion_w2a.write_canonical_joints(folder, body.shaped(poses[0].betas)[1])
     for frame, image, mask in zip(NAMES, images, masks, strict=True):
         ocmotion_w2a.write_frame(folder, frame, image, mask)
     return Written(root, cameras, poses, images, masks)
@@ -230,28 +229,18 @@ def test_masks_have_three_channels(w2a):
     assert set(np.unique(mask)) == {0, 255}
 
 
-def test_mesh_infos_give_the_body_in_the_world_of_cameras_pkl(w2a, smpl):
-    """R(Rh) (joints) + Th, seen by the folded camera, is what the true camera sees of the posed joints."""
+def test_mesh_infos_give_the_body_before_its_translation(w2a, smpl):
+    """R(Rh) (joints) + Th, moved by the translation, is what the true camera sees of the posed joints."""
     infos = pickle.loads((w2a.root / NAME / "mesh_infos.pkl").read_bytes())
-    cameras = pickle.loads((w2a.root / NAME / "cameras.pkl").read_bytes())
-    assert list(infos) == list(cameras) == NAMES
+    assert list(infos) == NAMES
     for frame, name in enumerate(NAMES):
         info, pose = infos[name], w2a.poses[frame]
         assert not info["poses"][:3].any()
         assert info["poses"].shape == (72,)
         np.testing.assert_allclose(info["tpose_joints"], smpl.shaped(pose.betas)[1] - info["Th"], atol=1e-6)
         world = Rotation.from_rotvec(info["Rh"]).apply(info["joints"]) + info["Th"]
-        E = cameras[name]["extrinsics"]
-        seen = world @ E[:3, :3].T + E[:3, 3]
+        seen = w2a.cameras[OWN].to_camera(world + pose.transl)
         np.testing.assert_allclose(seen, w2a.cameras[OWN].to_camera(smpl.posed_joints(pose)), atol=1e-5)
-        np.testing.assert_allclose(cameras[name]["intrinsics"], w2a.cameras[OWN].K_opencv)
-
-
-def test_canonical_joints(w2a, smpl):
-    joints = pickle.loads((w2a.root / NAME / "canonical_joints.pkl").read_bytes())["joints"]
-    np.testing.assert_array_equal(joints, smpl.shaped(w2a.poses[0].betas)[1])
-    with pytest.raises(ValueError, match=r"expected shape \[24, 3\], got \[23, 3\]"):
-        ocmotion_w2a.write_canonical_joints(w2a.root, joints[1:])
 
 
 def test_novel_cameras(w2a):
@@ -266,7 +255,7 @@ def test_novel_cameras_with_the_translation_folded_in(sequence, w2a):
     for frame, name in enumerate(NAMES):
         moved = np.eye(4)
         moved[:3, 3] = w2a.poses[frame].transl
-        stored = [ocmotion.stored_camera(camera) for camera in w2a.cameras]
+        stored = [stored_camera(camera, "OcMotion") for camera in w2a.cameras]
         frames[name] = {
             "intrinsics": np.stack([K for K, _ in stored]).astype(np.float32),
             "extrinsics": np.stack([E @ moved for _, E in stored]).astype(np.float32),

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +20,7 @@ from ihbench.clock.progress import Progress
 from ihbench.diffusion.crops.part_map import part_labels
 from ihbench.diffusion.crops.person_crop import PADDING, person_crop
 from ihbench.errors import BadInput
-from ihbench.files import atomic
-from ihbench.files.npz import read_npz
+from ihbench.files.npz import read_npz, write_npz
 
 VERSION = 2  # of what is kept of a photograph
 PAGE = 100  # people per file
@@ -106,10 +104,8 @@ def _write_page(work: tuple[str, int, int, int, Path]) -> None:
     people, start, each, size, path = work
     page = make_page(people, start, PAGE, each, size)
     words = np.array(["\n".join(phrases) for phrases in page.phrases])
-    buffer = BytesIO()
     arrays = {name: getattr(page, name) for name in ("widths", "images", "silhouettes", "parts", "person", "traits")}
-    np.savez(buffer, phrases=words, **arrays)
-    atomic.write_bytes(path, buffer.getvalue())
+    write_npz(path, {"phrases": words, **arrays})
 
 
 def _read_page(path: Path) -> Page:
