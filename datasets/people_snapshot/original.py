@@ -35,7 +35,7 @@ from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera, off_orthogonal
 from ihbench.datasets.reading.capture_folder import BY_OPTIONS, CaptureFolder
 from ihbench.datasets.reading.pickles import write_pickle
-from ihbench.datasets.reading.plausibility import share_inside
+from ihbench.datasets.reading.plausibility import share_inside, some
 from ihbench.datasets.reading.stored_numbers import numbers
 from ihbench.datasets.reading.subject_folders import SubjectFolders, View
 from ihbench.errors import BadInput
@@ -276,8 +276,7 @@ def report_spoiled_rows(report: SubjectReport, path: Path, *arrays: NDArray) -> 
     bad = [~np.isfinite(array.reshape(len(array), -1)).all(1) for array in arrays]
     rows = np.flatnonzero(np.any(bad, axis=0)).tolist()
     if rows:
-        named = ", ".join(str(row) for row in rows[:5]) + (", …" if len(rows) > 5 else "")
-        state = f"NaN or infinity in {len(rows)} row{'s' * (len(rows) > 1)} ({named})"
+        state = f"NaN or infinity in {len(rows)} row{'s' * (len(rows) > 1)} ({some([str(row) for row in rows])})"
         report.problem(f"{path}: {state}; leave these out {BY_OPTIONS}")
 
 

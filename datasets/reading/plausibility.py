@@ -55,6 +55,21 @@ ADVICE = {
     "double": "K looks like that of pictures twice as large; divide its first two rows by 2",
 }
 SCALES = {"half": 2.0, "double": 0.5}
+PLACES = {  # what is wrong with where the body stands before a camera
+    "far": f"the body is {{value:.4g}} m in front of it, more than {FARTHEST:.0f} m: t or transl look like {{unit}}; "
+    "expected metres, divide by {factor}",
+    "near": f"the body is {{value:.3g}} m in front of it, less than {NEAREST} m: t or transl are not in metres, or "
+    "one of them is missing",
+    "behind": "sees no body in the sampled frames; it is {value:.3g} m behind it: expected R, t from world to "
+    "camera, with OpenCV axes (z forward)",
+    "aside": "sees no body in the sampled frames; it is {value:.3g} m in front of it, out of the picture: check K, "
+    "R, t and the frames of the poses",
+    "inside": "stands inside the body, whose middle is {value:.3g} m in front of it; check the units of t and transl",
+    "small": "the person is {value:.0f} px tall; expected pictures with more of them, or check the units of t and "
+    "transl",
+    "cut": "only {value:.0%} of the body lies in the picture; right for close-ups, else check K and the units of t "
+    "and transl",
+}
 
 
 @dataclass
@@ -74,7 +89,7 @@ class Outline:
         if self.faces is not None:
             return points, rasterize(points, self.faces, view.height, view.width).mask
         dots = np.zeros((view.height, view.width), bool)
-        seen = _seen(points, view)
+        seen = _in_picture(points, view.height, view.width)
         dots[points[seen, 1].astype(int), points[seen, 0].astype(int)] = True
         return points, np.asarray(binary_closing(np.pad(dots, 8), iterations=4)[8:-8, 8:-8], bool)
 
@@ -121,12 +136,14 @@ class Overlap:
 
 def share_inside(points: Array, region: Mask) -> float:
     """The share of projected points [V, 3] (x px, y px, depth m) that fall on the region [H, W]."""
-    height, width = region.shape
+    column, row = points[_in_picture(points, *region.shape), :2].astype(int).T
+    return float(region[row, column].sum()) / len(points)
+
+
+def _in_picture(points: Array, height: int, width: int) -> Mask:
     with np.errstate(invalid="ignore"):
-        column, row = np.floor(points[:, 0]), np.floor(points[:, 1])
-        seen = (points[:, 2] > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    hits = region[row[seen].astype(int), column[seen].astype(int)].sum()
-    return float(hits) / len(points)
+        x, y = points[:, 0], points[:, 1]
+        return (points[:, 2] > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
 
 
 @np.errstate(all="ignore")  # absurd numbers overflow, and are named
@@ -237,7 +254,7 @@ def _check_cameras(capture: CaptureFolder, report: SubjectReport) -> list[int]:
     for names in same.values():
         if len(names) > 1:
             report.problem(
-                f"cameras {_some(names)}: have one and the same K, R and t; expected each camera's own calibration"
+                f"cameras {some(names)}: have one and the same K, R and t; expected each camera's own calibration"
             )
     return usable
 
@@ -290,8 +307,8 @@ def _check_placement(
     capture: CaptureFolder, cameras: Sequence[int], posed: Sequence[Outline], report: SubjectReport
 ) -> list[int]:
     """Name cameras with implausible units or without the body in view; return the others."""
-    groups: dict[str, list[tuple[int, float]]] = {"far": [], "near": [], "behind": [], "aside": [], "inside": []}
-    good, small, cut = [], [], []
+    groups: dict[str, list[tuple[int, float]]] = {kind: [] for kind in PLACES}  # camera, and m, px or share
+    good = []
     for camera in cameras if posed else ():
         view = capture.camera(camera)
         points = np.concatenate([view.project(body.vertices) for body in posed])
@@ -307,36 +324,16 @@ def _check_placement(
             groups["inside"].append((camera, depth))
         else:
             good.append(camera)
-            heights = [np.ptp(view.project(body.vertices)[:, 1]) for body in posed]
-            small += [(camera, float(np.median(heights)))] if np.median(heights) < SMALL else []
-            cut += [(camera, share)] if share < 0.4 else []
-    texts = {
-        "far": "the body is {:.4g} m in front of it, more than " + f"{FARTHEST:.0f} m: t or transl look like ",
-        "near": "the body is {:.3g} m in front of it, less than "
-        + f"{NEAREST} m: t or transl are not in metres, or one of them is missing",
-        "behind": "sees no body in the sampled frames; it is {:.3g} m behind it: expected R, t from world to camera, "
-        "with OpenCV axes (z forward)",
-        "aside": "sees no body in the sampled frames; it is {:.3g} m in front of it, out of the picture: check K, R, "
-        "t and the frames of the poses",
-        "inside": "stands inside the body, whose middle is {:.3g} m in front of it; check the units of t and transl",
-    }
+            height = float(np.median([np.ptp(view.project(body.vertices)[:, 1]) for body in posed]))
+            groups["small"] += [(camera, height)] if height < SMALL else []
+            groups["cut"] += [(camera, share)] if share < 0.4 else []
     for kind, group in groups.items():
         if group:
-            text = texts[kind].format(abs(group[0][1]))
-            if kind == "far":
-                unit, factor = ("millimetres", 1000) if abs(group[0][1]) > 900 else ("centimetres", 100)
-                text += f"{unit}; expected metres, divide by {factor}"
-            report.problem(f"{_cameras(capture, [camera for camera, _ in group])}: {text}")
-    if small:
-        report.warn(
-            f"{_cameras(capture, [camera for camera, _ in small])}: the person is {small[0][1]:.0f} px tall; "
-            f"expected pictures with more of them, or check the units of t and transl"
-        )
-    if cut:
-        report.warn(
-            f"{_cameras(capture, [camera for camera, _ in cut])}: only {cut[0][1]:.0%} of the body lies in the "
-            f"picture; right for close-ups, else check K and the units of t and transl"
-        )
+            value = abs(group[0][1])
+            unit, factor = ("millimetres", 1000) if value > 900 else ("centimetres", 100)
+            text = PLACES[kind].format(value=value, unit=unit, factor=factor)
+            tell = report.warn if kind in ("small", "cut") else report.problem
+            tell(f"{_cameras(capture, [camera for camera, _ in group])}: {text}")
     return good
 
 
@@ -406,10 +403,7 @@ def _check_shape(capture: CaptureFolder, report: SubjectReport) -> bool:
 
 
 def _check_images(
-    capture: CaptureFolder,
-    views: Sequence[tuple[int, int]],
-    samples: int,
-    report: SubjectReport,
+    capture: CaptureFolder, views: Sequence[tuple[int, int]], samples: int, report: SubjectReport
 ) -> None:
     """Decode `samples` images a camera and the image after each: damaged ones, and pictures that stand still."""
     sizes, decoded_images = set(), 0
@@ -448,14 +442,10 @@ def _check_softness(capture: CaptureFolder, masks: dict[tuple[int, int], Mask], 
     """Name mattes: what a threshold at zero and one in the middle make of them differs."""
     soft: list[tuple[float, float, float, int, Path]] = []
     for camera, frame in _evenly(list(masks), 8):
-        path = next(
-            (path for path in capture.files_of(camera, frame, "mask")[1:] if path.suffix.lower() == ".png"), None
-        )
-        if path is None:
-            continue
+        paths = (path for path in capture.files_of(camera, frame, "mask")[1:] if path.suffix.lower() == ".png")
         try:
-            picture = read_picture(path, colours_matter=False)
-        except BadInput:  # named where the mask was read
+            picture = read_picture(path := next(paths), colours_matter=False)
+        except (StopIteration, BadInput):  # no picture; a damaged one is named where the mask was read
             continue
         values = picture.colour.max(2)
         n_values, middle = len(np.unique(values)), float((values > picture.white / 2).mean())
@@ -497,17 +487,16 @@ def _check_masks_alone(
             f"{len(full)} of {len(masks)} masks looked at cover whole pictures ({_views(capture, full)}); expected 0 "
             f"where the person is not"
         )
-    if empty and whole:
-        report.problem(f"{len(empty)} of {len(masks)} masks looked at are empty ({_views(capture, empty)})")
-    elif empty:
-        report.warn(f"{len(empty)} of {len(masks)} masks looked at are empty ({_views(capture, empty)})")
+    if empty:
+        text = f"{len(empty)} of {len(masks)} masks looked at are empty ({_views(capture, empty)})"
+        (report.problem if whole else report.warn)(text)
     share = float(np.median([mask.mean() for mask in masks.values()]))
     if share > 0.6:
         report.warn(f"the masks make {share:.0%} of the pictures a person; right for close-ups only")
     several = []
     for view, mask in masks.items():
-        small = mask[_rows(mask.shape[0])][:, _rows(mask.shape[1])]
-        parts: Any = label(small)  # [h, w] with numbers, and how many
+        rows, columns = (np.linspace(0, n - 1, min(n, SIDE)).round().astype(int) for n in mask.shape)
+        parts: Any = label(mask[rows][:, columns])  # [h, w] with numbers, and how many
         sizes = np.sort(np.bincount(parts[0].ravel())[1:])
         if len(sizes) > 1 and sizes[-2] > 0.25 * sizes[-1]:
             several.append(view)
@@ -518,26 +507,26 @@ def _check_masks_alone(
         )
 
 
-def _rows(length: int) -> NDArray[np.intp]:
-    """At most `SIDE` of the rows (or columns) of a mask, evenly."""
-    return np.linspace(0, length - 1, min(length, SIDE)).round().astype(int)
-
-
 # ---------------------------------------------------------------------------------------- masks and bodies
 
 
 def _overlap(view: Camera, body: Outline, mask: Mask, camera: int, frame: int) -> Overlap:
     from scipy.ndimage import binary_dilation
 
-    small = _small(view)
-    part = _at(mask, small)
+    shrink = min(1.0, SIDE / max(view.width, view.height))
+    small = view.scaled(max(1, round(view.width * shrink)), max(1, round(view.height * shrink)))
+    rows = ((np.arange(small.height) + 0.5) * mask.shape[0] / small.height).astype(int)
+    columns = ((np.arange(small.width) + 0.5) * mask.shape[1] / small.width).astype(int)
+    part = mask[rows][:, columns]  # the nearest pixels
     points, drawn = body.drawn(small)
     grown = np.asarray(binary_dilation(part, iterations=max(1, small.width // 100)), bool)
     iou = {"": _iou(part, drawn)}
     if iou[""] < 1 - CLEARLY:
         iou |= {name: _iou(change(part), drawn) for name, change in CHANGES.items()}
         iou["head down"] = _iou(part, _on_its_head(drawn))
-        iou |= {name: _iou(part, body.drawn(_enlarged(small, factor))[1]) for name, factor in SCALES.items()}
+        for name, factor in SCALES.items():
+            scaled = replace(small, K=np.diag([factor, factor, 1.0]) @ small.K)
+            iou[name] = _iou(part, body.drawn(scaled)[1])
     return Overlap(
         camera,
         frame,
@@ -554,23 +543,6 @@ def _overlap(view: Camera, body: Outline, mask: Mask, camera: int, frame: int) -
     )
 
 
-def _enlarged(view: Camera, factor: float) -> Camera:
-    """The view with the first two rows of its K multiplied, as for pictures of another size."""
-    return replace(view, K=np.diag([factor, factor, 1.0]) @ view.K)
-
-
-def _small(view: Camera) -> Camera:
-    shrink = min(1.0, SIDE / max(view.width, view.height))
-    return view.scaled(max(1, round(view.width * shrink)), max(1, round(view.height * shrink)))
-
-
-def _at(mask: Mask, view: Camera) -> Mask:
-    """A mask [H, W] at the size of a smaller view, by the nearest pixel."""
-    rows = ((np.arange(view.height) + 0.5) * mask.shape[0] / view.height).astype(int)
-    columns = ((np.arange(view.width) + 0.5) * mask.shape[1] / view.width).astype(int)
-    return mask[rows][:, columns]
-
-
 def _on_body(mask: Mask, drawn: Mask) -> float:
     from scipy.ndimage import binary_dilation
 
@@ -583,23 +555,16 @@ def _on_body(mask: Mask, drawn: Mask) -> float:
 
 def _on_its_head(drawn: Mask) -> Mask:
     """The silhouette turned about the middle of its own box."""
-    if not drawn.any():
-        return drawn
-    rows, columns = (np.flatnonzero(drawn.any(axis)) for axis in (1, 0))
-    window = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    from scipy.ndimage import find_objects
+
     turned = np.zeros_like(drawn)
-    turned[window] = drawn[window][::-1]
+    for window in find_objects(drawn.astype(np.uint8)):
+        turned[window] = drawn[window][::-1]
     return turned
 
 
 def _iou(a: Mask, b: Mask) -> float:
     return float((a & b).sum()) / max(1, int((a | b).sum()))
-
-
-def _seen(points: Array, view: Camera) -> Mask:
-    with np.errstate(invalid="ignore"):
-        x, y = points[:, 0], points[:, 1]
-        return (points[:, 2] > 0) & (x >= 0) & (x < view.width) & (y >= 0) & (y < view.height)
 
 
 def _check_fit(
@@ -674,8 +639,7 @@ def _check_single_views(
         return False
     worst = min(out, key=lambda fit: fit.mask_on_body if fit.area else 0)
     state = f"has {worst.mask_on_body:.0%} on the body, and {worst.vertices_in_mask:.0%} of it"
-    state = state if worst.area else "is empty"
-    state = "covers the whole picture" if worst.area > 0.98 else state
+    state = "is empty" if not worst.area else "covers the whole picture" if worst.area > 0.98 else state
     report.problem(
         f"{len(out)} of {len(fits)} masks looked at do not show the body of their frame "
         f"({_views(capture, [(fit.camera, fit.frame) for fit in out])}; that of frame {capture.label(worst.frame)} "
@@ -698,6 +662,7 @@ def _unlike(fits: Sequence[Overlap], covered: float, inside: float) -> str:
 def _shift(fits: Sequence[Overlap]) -> tuple[float, str] | None:
     """How much overlap is to be gained, and the advice to move the masks; None where none helps all views."""
     from scipy.fft import irfft2, rfft2
+    from scipy.ndimage import shift
 
     moves = []
     for fit in _evenly(fits, 8):
@@ -706,10 +671,7 @@ def _shift(fits: Sequence[Overlap]) -> tuple[float, str] | None:
         score = np.asarray(irfft2(spectra[0] * np.conj(spectra[1]), size))
         y, x = np.unravel_index(int(score.argmax()), size)
         y, x = (int(v - n if v >= n // 2 else v) for v, n in ((y, size[0]), (x, size[1])))
-        moved = np.zeros_like(fit.mask)
-        rows, columns = np.nonzero(fit.mask)
-        keep = (rows + y >= 0) & (rows + y < len(moved)) & (columns + x >= 0) & (columns + x < moved.shape[1])
-        moved[rows[keep] + y, columns[keep] + x] = True
+        moved = np.asarray(shift(fit.mask, (y, x), order=0), bool)
         moves.append((x / fit.mask.shape[1], y / fit.mask.shape[0], _iou(moved, fit.body), fit.iou[""]))
     x, y, there, before = np.mean(moves, axis=0)
     if there < before + CLEARLY or there < 0.6 or np.std(moves, axis=0)[:2].max() > 0.02:
@@ -796,13 +758,13 @@ def _views(capture: CaptureFolder, views: Sequence[tuple[int, int]]) -> str:
     several = len(capture.camera_ids) > 1
     labels = [capture.label(frame) for _, frame in views]
     named = [f"{capture.camera_ids[c]}/{n}" if several else n for (c, _), n in zip(views, labels, strict=True)]
-    return f"frame{'s' * (len(named) > 1)} {_some(named)}"
+    return f"frame{'s' * (len(named) > 1)} {some(named)}"
 
 
 def _cameras(capture: CaptureFolder, cameras: Sequence[int]) -> str:
     names = [capture.camera_ids[camera] for camera in cameras]
-    return f"camera{'s' * (len(names) > 1)} {_some(names)}"
+    return f"camera{'s' * (len(names) > 1)} {some(names)}"
 
 
-def _some(names: Sequence[str]) -> str:
+def some(names: Sequence[str]) -> str:
     return ", ".join(names[:5]) + (", …" if len(names) > 5 else "")
