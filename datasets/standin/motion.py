@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -270,20 +271,6 @@ def _kick(phase: Array) -> Array:
     return pose
 
 
-def _squat(phase: Array) -> Array:
-    down = (0.5 - 0.5 * np.cos(phase)) ** 1.3
-    pose = _standing(phase)
-    _turn_both(pose, "hip", x=-88 * down, z=12 * down)
-    _turn_both(pose, "knee", x=98 * down)
-    _turn_both(pose, "ankle", x=-28 * down)
-    _turn(pose, "pelvis", x=14 * down)
-    _turn(pose, "spine1", x=12 * down)
-    _turn(pose, "spine2", x=6 * down)
-    _turn(pose, "neck", x=-20 * down)
-    _turn_both(pose, "shoulder", y=-72 * down, z=50 * down)
-    return pose
-
-
 def _twist(phase: Array) -> Array:
     s = np.sin(phase)
     pose = _standing(phase)
@@ -309,18 +296,6 @@ def _wave(phase: Array) -> Array:
     _turn(pose, "left_hip", x=-4 * np.maximum(sway, 0))
     _turn(pose, "right_knee", x=8 * np.maximum(-sway, 0))
     _turn(pose, "right_hip", x=-4 * np.maximum(-sway, 0))
-    return pose
-
-
-def _overhead(phase: Array) -> Array:
-    """Both arms up at the sides and down again, on the toes at the top."""
-    up = (0.5 - 0.5 * np.cos(phase)) ** 1.2
-    pose = _standing(phase)
-    _turn_both(pose, "shoulder", z=112 * up)
-    _turn_both(pose, "collar", z=16 * up)
-    _turn_both(pose, "elbow", y=8 * up)
-    _turn_both(pose, "ankle", x=14 * up)
-    _turn_both(pose, "foot", x=-12 * up)
     return pose
 
 
@@ -354,43 +329,46 @@ def _march(phase: Array) -> Array:
     return pose
 
 
-def _lunge(phase: Array) -> Array:
-    """One foot far ahead, the hips low, both arms out at the sides."""
-    down = (0.5 - 0.5 * np.cos(phase)) ** 1.2
-    pose = _standing(phase)
-    _turn(pose, "left_hip", x=-62 * down)
-    _turn(pose, "left_knee", x=66 * down)
-    _turn(pose, "right_hip", x=34 * down)
-    _turn(pose, "right_knee", x=34 * down)
-    _turn(pose, "right_ankle", x=16 * down)
-    _turn_both(pose, "shoulder", z=58 * down)
-    return pose
+# power of the movement down and up again, and degrees (x, y, z) at its end; "hip" is both hips, given for the left
+BENT: dict[str, tuple[float, dict[str, tuple[float, float, float]]]] = {
+    "squat": (1.3, {
+        "hip": (-88, 0, 12), "knee": (98, 0, 0), "ankle": (-28, 0, 0), "pelvis": (14, 0, 0), "spine1": (12, 0, 0),
+        "spine2": (6, 0, 0), "neck": (-20, 0, 0), "shoulder": (0, -72, 50),
+    }),
+    # both arms up at the sides, on the toes at the top
+    "overhead": (1.2, {
+        "shoulder": (0, 0, 112), "collar": (0, 0, 16), "elbow": (0, 8, 0), "ankle": (14, 0, 0), "foot": (-12, 0, 0),
+    }),
+    # one foot far ahead, the hips low, both arms out at the sides
+    "lunge": (1.2, {
+        "left_hip": (-62, 0, 0), "left_knee": (66, 0, 0), "right_hip": (34, 0, 0), "right_knee": (34, 0, 0),
+        "right_ankle": (16, 0, 0), "shoulder": (0, 0, 58),
+    }),
+    # forwards from the hips, the arms crossed before the chest
+    "bow": (1.4, {
+        "hip": (-40, 0, 0), "pelvis": (38, 0, 0), "spine1": (16, 0, 0), "spine2": (12, 0, 0), "neck": (-14, 0, 0),
+        "shoulder": (0, -52, 6), "elbow": (0, -78, 0),
+    }),
+}  # fmt: skip
 
 
-def _bow(phase: Array) -> Array:
-    """Bending forwards from the hips with the arms crossed before the chest."""
-    down = (0.5 - 0.5 * np.cos(phase)) ** 1.4
+def _bend(name: str, phase: Array) -> Array:
+    power, angles = BENT[name]
+    amount = (0.5 - 0.5 * np.cos(phase)) ** power
     pose = _standing(phase)
-    _turn_both(pose, "hip", x=-40 * down)
-    _turn(pose, "pelvis", x=38 * down)
-    _turn(pose, "spine1", x=16 * down)
-    _turn(pose, "spine2", x=12 * down)
-    _turn(pose, "neck", x=-14 * down)
-    _turn_both(pose, "shoulder", y=-52 * down, z=6 * down)
-    _turn_both(pose, "elbow", y=-78 * down)
+    for joint, (x, y, z) in angles.items():
+        turn = _turn if joint in JOINT_INDEX else _turn_both
+        turn(pose, joint, x * amount, y * amount, z * amount)
     return pose
 
 
 EXERCISES: dict[str, Callable[[Array], Array]] = {
     "arm_swing": _arm_swing,
     "kick": _kick,
-    "squat": _squat,
     "twist": _twist,
     "wave": _wave,
-    "overhead": _overhead,
     "punch": _punch,
     "march": _march,
-    "lunge": _lunge,
-    "bow": _bow,
+    **{name: partial(_bend, name) for name in BENT},
 }
 NOVEL = ("march", "lunge", "bow")  # nobody does these among the exercises

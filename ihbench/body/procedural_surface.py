@@ -9,7 +9,7 @@ made for x >= 0 and mirrored, so the body is exactly symmetric.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,39 +124,25 @@ FINGERS = (
 )
 
 
-def pair(shape: Callable[[int], Array], blend: float) -> Array:
-    """A shape and its mirror image, `shape(LEFT)` and `shape(RIGHT)`, as one field: adding them one after the other
-    to a body would not be symmetric."""
-    return smooth_union(shape(LEFT), shape(RIGHT), blend)
+def ellipsoids(points: Array, centre: tuple[float, float, float], radii: Sequence[float], blend: float) -> Array:
+    """An ellipsoid and its mirror image as one field: adding one after the other to a body would not be symmetric."""
+    x, y, z = centre
+    return smooth_union(ellipsoid(points, (x, y, z), radii), ellipsoid(points, (-x, y, z), radii), blend)
 
 
 def torso(points: Array) -> Array:
-    def chest(s: int) -> Array:
-        return ellipsoid(points, (s * 0.068, 0.335, 0.066), (0.070, 0.052, 0.034))
-
-    def buttock(s: int) -> Array:
-        return ellipsoid(points, (s * 0.085, -0.085, -0.075), (0.085, 0.090, 0.075))
-
-    def shoulder_blade(s: int) -> Array:
-        return ellipsoid(points, (s * 0.082, 0.370, -0.060), (0.078, 0.090, 0.046))
-
-    def trapezius(s: int) -> Array:
-        return round_cone(points, (s * 0.02, 0.485, -0.03), (s * 0.165, 0.433, -0.02), 0.045, 0.046)
-
     d = loft(points, 1, TORSO_PROFILE, exponent=2.35)
-    d = smooth_union(d, pair(chest, 0.055), 0.055)
-    d = smooth_union(d, pair(buttock, 0.05), 0.05)
-    d = smooth_union(d, pair(shoulder_blade, 0.05), 0.05)
-    return smooth_union(d, pair(trapezius, 0.05), 0.05)
+    chest = ellipsoids(points, (0.068, 0.335, 0.066), (0.070, 0.052, 0.034), 0.055)
+    buttocks = ellipsoids(points, (0.085, -0.085, -0.075), (0.085, 0.090, 0.075), 0.05)
+    shoulder_blades = ellipsoids(points, (0.082, 0.370, -0.060), (0.078, 0.090, 0.046), 0.05)
+    d = smooth_union(smooth_union(smooth_union(d, chest, 0.055), buttocks, 0.05), shoulder_blades, 0.05)
+    left, right = (
+        round_cone(points, (s * 0.02, 0.485, -0.03), (s * 0.165, 0.433, -0.02), 0.045, 0.046) for s in (LEFT, RIGHT)
+    )
+    return smooth_union(d, smooth_union(left, right, 0.05), 0.05)  # trapezius
 
 
 def head(points: Array) -> Array:
-    def ear(s: int) -> Array:
-        return ellipsoid(points, (s * 0.075, 0.672, -0.008), (0.010, 0.028, 0.017))
-
-    def eye_socket(s: int) -> Array:
-        return ellipsoid(points, (s * 0.031, 0.686, 0.096), (0.016, 0.009, 0.012))
-
     d = round_cone(points, (0, 0.44, -0.022), (0, 0.60, 0), 0.058, 0.052)  # neck
     d = smooth_union(d, ellipsoid(points, (0, 0.708, -0.010), (0.075, 0.092, 0.100)), 0.03)  # skull
     d = smooth_union(d, ellipsoid(points, (0, 0.648, 0.034), (0.054, 0.072, 0.060)), 0.035)  # face and jaw
@@ -164,8 +150,8 @@ def head(points: Array) -> Array:
     d = smooth_union(d, round_cone(points, (0, 0.692, 0.086), (0, 0.655, 0.106), 0.008, 0.0105), 0.014)  # nose
     d = smooth_union(d, ellipsoid(points, (0, 0.627, 0.086), (0.024, 0.009, 0.012)), 0.010)  # lips
     d = smooth_union(d, ellipsoid(points, (0, 0.700, 0.078), (0.050, 0.012, 0.014)), 0.020)  # brow
-    d = smooth_union(d, pair(ear, 0.010), 0.010)
-    return smooth_cut(d, pair(eye_socket, 0.014), 0.014)
+    d = smooth_union(d, ellipsoids(points, (0.075, 0.672, -0.008), (0.010, 0.028, 0.017), 0.010), 0.010)  # ears
+    return smooth_cut(d, ellipsoids(points, (0.031, 0.686, 0.096), (0.016, 0.009, 0.012), 0.014), 0.014)  # sockets
 
 
 def arm(points: Array, side: int) -> Array:
