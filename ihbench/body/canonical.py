@@ -6,13 +6,12 @@ legs, and a negative turn of the left shoulder about z lowers the arm.
 
 from __future__ import annotations
 
-import difflib
-
 import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.body.skeleton import JOINT_INDEX
 from ihbench.errors import BadInput
+from ihbench.registry import nearest
 
 # name -> degrees about z per joint; every other component is 0
 CANONICAL_POSES: dict[str, dict[str, float]] = {
@@ -32,9 +31,7 @@ CANONICAL_POSES: dict[str, dict[str, float]] = {
 def canonical_pose(name: str) -> NDArray[np.float64]:
     """[24, 3] rad, the named canonical pose. Raises `BadInput` on an unknown name."""
     if name not in CANONICAL_POSES:
-        near = difflib.get_close_matches(name, CANONICAL_POSES, n=1, cutoff=0.4)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise BadInput(f"canonical pose {name!r} is unknown: expected one of {', '.join(CANONICAL_POSES)}{hint}")
+        raise BadInput(f"unknown canonical pose {name!r}: {nearest(name, list(CANONICAL_POSES))}")
     pose = np.zeros((24, 3))
     for joint, degrees in CANONICAL_POSES[name].items():
         pose[JOINT_INDEX[joint], 2] = np.deg2rad(degrees)

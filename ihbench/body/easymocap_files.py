@@ -88,13 +88,12 @@ class _Storage:
         if not self.path.is_file():
             raise BadInput(f"{path}: no such file; expected EasyMocap's intri.yml or extri.yml")
         try:
-            self.storage = cv2.FileStorage(
-                self.path.read_text(encoding="utf-8-sig"), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY
-            )
+            text = self.path.read_text(encoding="utf-8-sig")
+            self.storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+            if not self.storage.isOpened():
+                raise OSError
         except (cv2.error, SystemError, OSError, UnicodeDecodeError):
             raise BadInput(f"{path}: not a YAML file as OpenCV writes it; copy it again") from None
-        if not self.storage.isOpened():
-            raise BadInput(f"{path}: not a YAML file as OpenCV writes it; copy it again")
 
     def names(self) -> list[str]:
         node = self.storage.getNode("names")

@@ -79,8 +79,7 @@ class Body:
 
     def posed_joints(self, body_pose: BodyPose) -> Array:
         """[24, 3] m, the joints in the posed world."""
-        joints = self.shaped(body_pose.betas)[1]
-        transforms = skinning_numpy.joint_transforms(body_pose.pose, joints, self.parents, body_pose.transl)
+        joints, transforms = self.shaped(body_pose.betas)[1], self.joint_transforms(body_pose)
         return np.einsum("kab,kb->ka", transforms[:, :3, :3], joints) + transforms[:, :3, 3]
 
     def pose(
@@ -95,15 +94,14 @@ class Body:
         `blend_shapes=False` leaves SMPL's pose correctives out. `offsets` are added to the shaped T-pose before
         skinning (clothes, hair).
         """
-        vertices, joints = self.shaped(body_pose.betas)
+        vertices = self.shaped(body_pose.betas)[0]
         if blend_shapes and self.posedirs is not None:
             vertices = vertices + skinning_numpy.pose_blend_offsets(body_pose.pose, self.posedirs)
         if offsets is not None:
             if np.shape(offsets) != vertices.shape:
                 raise ValueError(f"offsets: expected {vertices.shape} like the vertices, got {np.shape(offsets)}")
             vertices = vertices + offsets
-        transforms = skinning_numpy.joint_transforms(body_pose.pose, joints, self.parents, body_pose.transl)
-        return skinning_numpy.lbs(vertices, self.weights, transforms)
+        return skinning_numpy.lbs(vertices, self.weights, self.joint_transforms(body_pose))
 
     @cached_property
     def joints(self) -> Array:

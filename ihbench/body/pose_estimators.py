@@ -61,7 +61,7 @@ def from_weak_perspective(
         raise BadInput(
             f"weak perspective: expected scale, box size and focal length above 0, got {s:.4g}, {size:.4g}, {f:.4g}"
         )
-    width, height = _size(width, height)
+    width, height = whole_pixels(width), whole_pixels(height)
     per_metre = s * size / 2  # px
     transl = [tx + (cx - width / 2) / per_metre, ty + (cy - height / 2) / per_metre, f / per_metre]
     K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]])
@@ -81,7 +81,7 @@ def from_camera_space(
 
     Their camera is the origin of the world here. Raises `BadInput`, also for a body behind the camera.
     """
-    width, height = _size(width, height)
+    width, height = whole_pixels(width), whole_pixels(height)
     transl = _numbers("transl", transl, (3,))
     if transl[2] <= 0:
         raise BadInput(
@@ -109,11 +109,11 @@ def from_world(
     The world is kept as it is. Raises `BadInput`, also when image and body together stand along another axis than
     `up`: then the world was turned or flipped on the way. (Either of them alone may lie or look down.)
     """
-    width, height = _size(width, height)
+    width, height = whole_pixels(width), whole_pixels(height)
     if up not in UP_AXES:
         raise BadInput(f"up axis {up!r}: expected y or z")
     R = _numbers("R world to camera", R_w2c, (3, 3))
-    _check_rotations("R world to camera", R)
+    check_rotation(R, "R world to camera")
     t = _numbers("t world to camera", t_w2c, (3,))
     body_pose = BodyPose(_pose(pose), _betas(betas), _numbers("transl", transl, (3,)))
     upright = axis_angle_to_matrix(body_pose.pose[0])[:, 1] - R[1]  # of the body, plus that of the image
@@ -141,7 +141,6 @@ def from_smplx(
     """
     array = _numbers("SMPL-X pose", pose, None)
     if (shape := _without_ones(array.shape))[1:] == (3, 3) and 3 * shape[0] in SMPLX_SIZES:
-        _check_rotations("SMPL-X pose", array)
         array = matrix_to_axis_angle(array.reshape(shape))
     if array.size not in SMPLX_SIZES or len(_without_ones(array.shape)) > 2:
         raise BadInput(
@@ -187,7 +186,7 @@ def matrix_to_axis_angle(
     R = _numbers("rotation matrices", matrices, None)
     if R.shape[-2:] != (3, 3):
         raise BadInput(f"rotation matrices: expected shape [..., 3, 3], got {list(R.shape)}")
-    _check_rotations("rotation matrices", R)
+    check_rotation(R, "rotation matrices")
     m = {(i, j): R[..., i, j] for i in range(3) for j in range(3)}
     # 4 q qᵀ, a row for each of w, x, y, z: every row is the quaternion, scaled; the longest loses no digits
     products = [
@@ -262,7 +261,7 @@ def _pose(pose: Any) -> Array:
     array = _numbers("pose", pose, None)
     shape = _without_ones(array.shape)
     if shape == (24, 3, 3):
-        _check_rotations("pose by matrix_to_axis_angle", array)
+        check_rotation(array, "pose by matrix_to_axis_angle")
         return matrix_to_axis_angle(array.reshape(24, 3, 3))
     if shape not in ((72,), (24, 3)):
         hint = pose_hint(array.shape)
@@ -278,13 +277,6 @@ def _betas(betas: Any) -> Array:
     return array.reshape(-1)
 
 
-def _size(width: Any, height: Any) -> tuple[int, int]:
-    try:
-        return whole_pixels(width), whole_pixels(height)
-    except ValueError as error:
-        raise BadInput(str(error)) from None
-
-
 def _K(K: Any, width: int, height: int, pixel_center: float) -> Array:
     matrix = _numbers("K", K, None)
     if matrix.size == 1:
@@ -296,18 +288,8 @@ def _K(K: Any, width: int, height: int, pixel_center: float) -> Array:
     if _without_ones(matrix.shape) != (3, 3):
         raise BadInput(f"K: expected shape [3, 3] or a focal length, got {list(matrix.shape)}; give one frame's")
     matrix = without_rounding(matrix.reshape(3, 3))
-    try:
-        check_intrinsics(matrix, "K")
-    except ValueError as error:
-        raise BadInput(str(error)) from None
+    check_intrinsics(matrix, "K")
     if pixel_center not in (0.0, 0.5):
         raise BadInput(f"pixel_center {pixel_center!r}: expected 0.0 or 0.5")
     matrix[:2, 2] += 0.5 - pixel_center
     return matrix
-
-
-def _check_rotations(what: str, R: Array) -> None:
-    try:
-        check_rotation(R, what)
-    except ValueError as error:
-        raise BadInput(str(error)) from None

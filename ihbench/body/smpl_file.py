@@ -71,12 +71,10 @@ def find_model_file(folder: Path, gender: str = "neutral") -> Path:
     if gender not in ("neutral", "male", "female"):
         raise BadInput(f"body gender {gender!r}: expected neutral, male or female")
     name = re.compile(rf"(smpl_{gender}|basicmodel_({gender}|{gender[0]})_lbs_.*)\.(npz|pkl)", re.IGNORECASE)
-    for subfolder in (".", "smpl", "models", "smpl/models"):
-        place = folder / subfolder
-        if place.is_dir():
-            found = sorted(file for file in place.iterdir() if name.fullmatch(file.name))
-            if found:
-                return found[0]
+    places = [folder / subfolder for subfolder in (".", "smpl", "models", "smpl/models")]
+    files = (file for place in places if place.is_dir() for file in sorted(place.iterdir()))
+    if file := next((file for file in files if name.fullmatch(file.name)), None):
+        return file
     raise BadInput(
         f"{folder}: no SMPL_{gender.upper()}.pkl, .npz or basicModel_{gender[0]}_lbs_*.pkl; {WHERE_SMPL_IS}"
     )
@@ -85,20 +83,14 @@ def find_model_file(folder: Path, gender: str = "neutral") -> Path:
 def read_arrays(path: Path) -> dict[str, Any]:
     """The entries of a model file that this bench uses, as plain arrays (and `name` as text). Shapes unchecked."""
     if path.suffix.lower() == ".npz":
-        return _read_npz(path)
+        arrays = read_npz(path, (*REQUIRED, *OPTIONAL, "name"))
+        return arrays | {"name": str(arrays["name"])} if "name" in arrays else dict(arrays)
     if path.suffix.lower() != ".pkl":
         raise BadInput(f"{path}: expected a body file that ends in .pkl or .npz; {WHERE_SMPL_IS}")
     raw = load_pickle(path)
     if not isinstance(raw, dict):
         raise BadInput(f"{path}: expected a dictionary of model arrays, found a {type(raw).__name__}")
     return {key: _plain_array(raw[key], f"{path}: {key}") for key in (*REQUIRED, *OPTIONAL) if key in raw}
-
-
-def _read_npz(path: Path) -> dict[str, Any]:
-    arrays: dict[str, Any] = dict(read_npz(path, (*REQUIRED, *OPTIONAL, "name")))
-    if "name" in arrays:
-        arrays["name"] = str(arrays["name"])
-    return arrays
 
 
 def _plain_array(value: Any, where: str) -> NDArray:
@@ -129,8 +121,8 @@ def _foreign_array(value: ForeignObject, where: str) -> NDArray:
         np.add.at(dense, (rows, columns), state["data"])
         return dense
     if "idxs" in state:  # chumpy.reordering.Select: a slice of another object
-        chosen = _plain_array(state["a"], where).ravel()[np.asarray(state["idxs"])]
-        return chosen.reshape(state.get("preferred_shape", -1))
+        selected = _plain_array(state["a"], where).ravel()[np.asarray(state["idxs"])]
+        return selected.reshape(state.get("preferred_shape", -1))
     if kind == "transpose":
         return np.transpose(_plain_array(state["a"], where), state.get("axes"))
     if kind == "reshape":
@@ -151,9 +143,8 @@ def _body_from_arrays(arrays: dict[str, Any], path: Path, uv_path: Path | None, 
     shapedirs = arrays["shapedirs"].astype(np.float64)
     if n_betas is not None and not 0 < n_betas <= shapedirs.shape[2]:
         raise BadInput(f"{path}: has {shapedirs.shape[2]} shape coefficients, asked for {n_betas}")
-    beside = path.with_name("smpl_uv.obj")
-    if uv_path is None and "vt" not in arrays and beside.is_file():
-        uv_path = beside
+    if uv_path is None and "vt" not in arrays and path.with_name("smpl_uv.obj").is_file():
+        uv_path = path.with_name("smpl_uv.obj")
     if uv_path is not None:
         uv, uv_faces = read_uv_obj(uv_path, faces)
     elif "vt" in arrays:
@@ -219,8 +210,8 @@ def check_arrays(arrays: dict[str, Any], path: Path) -> None:
 def _check_array(array: NDArray, shape: tuple[int | None, ...], where: str) -> None:
     fits = array.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
     if not fits or array.size == 0:
-        wanted = ", ".join("any" if n is None else str(n) for n in shape)
-        raise BadInput(f"{where} has shape {array.shape}, expected ({wanted})")
+        expected = ", ".join("any" if n is None else str(n) for n in shape)
+        raise BadInput(f"{where} has shape {array.shape}, expected ({expected})")
     if array.dtype.kind not in "biuf" or not np.isfinite(array).all():
         raise BadInput(f"{where}: expected finite numbers")
 
@@ -243,8 +234,6 @@ def write_body(path: str | Path, body: Body) -> None:
         "ft": body.uv_faces,
         "name": np.array(body.name),
     }
-    if body.posedirs is not None:
-        arrays["posedirs"] = body.posedirs
-    if body.face_landmarks is not None:
-        arrays["face_landmarks"] = body.face_landmarks
+    optional = {"posedirs": body.posedirs, "face_landmarks": body.face_landmarks}
+    arrays |= {key: value for key, value in optional.items() if value is not None}
     write_npz(path, arrays, compressed=True)
