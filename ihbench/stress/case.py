@@ -30,12 +30,12 @@ class Case:
     """One stiff or extreme input. Changing what it asks means a new version."""
 
     name: str
-    group: str
     what: str  # in a line
+    function: Callable[[], Answer]
     unit: Unit  # of the error: see `error_of`
     tolerance: float
     why: str  # it is that large
-    function: Callable[[], Answer]
+    group: str
     known: str = ""  # why it is known to fail; "" for a case that must pass
     version: int = 1
 

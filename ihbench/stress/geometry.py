@@ -6,7 +6,6 @@ Expected numbers are closed forms, or exact rational arithmetic over the very fl
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from fractions import Fraction
 from functools import partial
 from typing import Any
@@ -21,7 +20,7 @@ from ihbench.camera import Camera, distort, look_at
 from ihbench.errors import BadInput
 from ihbench.render.zbuffer import NEAR, rasterize, vertex_normals
 from ihbench.scene.regions import projected_box
-from ihbench.stress.case import Answer, Case, Unit, words_of
+from ihbench.stress.case import Answer, Case, words_of
 
 ROTATION = "entries are at most 1 and take about 4 roundings; the angle's own rounding counts |angle| times"
 CHAIN = "a chain of up to 9 products of 3×3 matrices, some 5 roundings each"
@@ -46,22 +45,24 @@ def _torch_rotation(rotation: NDArray, dtype: str = "float64") -> NDArray[np.flo
     return axis_angle_to_matrix(torch.tensor(rotation, dtype=getattr(torch, dtype))).double().numpy()
 
 
+def _rotations(rotation: NDArray) -> NDArray[np.float64]:
+    """Of both twins, [2, ..., 3, 3]."""
+    return np.stack([skinning_numpy.axis_angle_to_matrix(rotation), _torch_rotation(rotation)])
+
+
 # ----------------------------------------------------------------------------------------------------
 # Rotations
 
 
 def _turn(angle: float) -> Answer:
     """Both twins about z, in ulps of 1. A relative change of the vector moves the matrix |angle| times as much."""
-    vector = np.array([0, 0, angle])
-    found = [skinning_numpy.axis_angle_to_matrix(vector), _torch_rotation(vector)]
-    return Answer(np.stack(found), about_z(angle), abs(angle), scale=max(1.0, abs(angle)))
+    size = abs(angle)
+    return Answer(_rotations(np.array([0, 0, angle])), about_z(angle), size, scale=max(1.0, size))
 
 
 def _small_sine(angle: float) -> Answer:
     """The entry sin(angle), in ulps of itself: nothing may be lost to 1."""
-    vector = np.array([0, 0, angle])
-    found = [skinning_numpy.axis_angle_to_matrix(vector)[1, 0], _torch_rotation(vector)[1, 0]]
-    return Answer(found, math.sin(angle), 1.0)
+    return Answer(_rotations(np.array([0, 0, angle]))[:, 1, 0], math.sin(angle), 1.0)
 
 
 def _single_precision(angle: float) -> Answer:
@@ -77,7 +78,7 @@ def _orthonormal() -> Answer:
     rng = np.random.default_rng(0)
     axes = rng.normal(size=(400, 3))
     axes *= (np.geomspace(1e-9, 30, 400) / np.linalg.norm(axes, axis=1))[:, None]
-    found = np.stack([skinning_numpy.axis_angle_to_matrix(axes), _torch_rotation(axes)])
+    found = _rotations(axes)
     return Answer(found @ found.swapaxes(-1, -2), np.eye(3), scale=1.0)
 
 
@@ -269,10 +270,6 @@ def _constant_map() -> Answer:
     return Answer([sample_uv(np.full((r, r, 1), 0.7), uv)[:, 0] for r in (1, 2, 64)], 0.7)
 
 
-def _empty_atlas() -> Answer:
-    return Answer(chart_padding(np.zeros((8, 8), np.bool_), 3), -1)
-
-
 # ----------------------------------------------------------------------------------------------------
 # Cameras
 
@@ -304,11 +301,6 @@ def _far_world() -> Answer:
     R, _ = look_at(np.array([0.0, 0.0, 3.0]), np.zeros(3))
     return _projected(Camera(K, R, np.array([0.1, 1e6, 1e6 + 3]), 512, 512),
                       (0.2, 1e6 + 0.25, 1e6 - 0.5))  # fmt: skip
-
-
-def _grazing() -> Answer:
-    """A point a micrometre in front of the camera plane."""
-    return _projected(front_camera(500.0), (1e-7, -2e-7, 1e-6))
 
 
 def _on_the_plane() -> Answer:
@@ -381,10 +373,11 @@ def _wrist_twist() -> Answer:
     return Answer(float((distance(moved) - distance(body.v_template)).max()), 0.0)
 
 
-def _geometry(
-    name: str, what: str, unit: Unit, tolerance: float, why: str, function: Callable[[], Answer], known: str = ""
-) -> Case:
-    return Case(name, "geometry", what, unit, tolerance, why, function, known)
+_geometry = partial(Case, group="geometry")
+_exact = partial(_geometry, unit="absolute", tolerance=0, why=EXACT)
+_refused = partial(_geometry, unit="words", tolerance=0, why="it must be refused")
+_rotation = partial(_geometry, unit="ulp", tolerance=4, why=ROTATION)
+_camera = partial(_geometry, unit="ulp", tolerance=8, why=RATIONAL)
 
 
 ANGLES = {
@@ -394,82 +387,78 @@ ANGLES = {
 
 CASES = [
     *(
-        _geometry(f"rotation-{name}", f"about z by {angle:g} rad", "ulp", 4, ROTATION, partial(_turn, angle))
+        _rotation(f"rotation-{name}", f"about z by {angle:g} rad", partial(_turn, angle))
         for name, angle in ANGLES.items()
     ),
     *(
-        _geometry(f"rotation-sine-{angle:g}", f"the sine of a turn by {angle:g} rad", "ulp", 2,
-                  "two or three roundings of a number that has lost nothing to 1", partial(_small_sine, angle), known)
+        _geometry(f"rotation-sine-{angle:g}", f"the sine of a turn by {angle:g} rad", partial(_small_sine, angle),
+                  "ulp", 2, "two or three roundings of a number that has lost nothing to 1", known=known)
         for angle, known in (
             (1e-300, "the numpy twin squares the vector, which is 0 below 1e-162: the turn is then none at all"),
             (1e-12, ""),
             (1e-5, ""),
         )
     ),
-    _geometry("rotation-float32-pi", "about z by π in single precision", "ulp", 4, ROTATION,
-              partial(_single_precision, math.pi)),
-    _geometry("rotation-orthonormal", "R Rᵀ of 400 turns by 1e-9 to 30 rad", "ulp", 8,
-              "two matrices with errors of 2 ulp, and their product", _orthonormal),
+    _rotation("rotation-float32-pi", "about z by π in single precision", partial(_single_precision, math.pi)),
+    _geometry("rotation-orthonormal", "R Rᵀ of 400 turns by 1e-9 to 30 rad", _orthonormal, "ulp", 8,
+              "two matrices with errors of 2 ulp, and their product"),
     *(
-        _geometry(f"rotation-gradient-{name}", f"d R / d v at {angle:g} rad", "ulp", tolerance, why,
-                  partial(_gradient, angle))
+        _geometry(f"rotation-gradient-{name}", f"d R / d v at {angle:g} rad", partial(_gradient, angle), "ulp",
+                  tolerance, why)
         for name, angle, tolerance, why in (
             ("zero", 0.0, 0, "the generators, exactly"),
             ("pi", math.pi, 8, ROTATION),
             ("two-pi", 2 * math.pi, 8, ROTATION),
         )
     ),
-    _geometry("chain-pi", "every joint turned by π", "ulp", 64, CHAIN, partial(_chain, math.pi)),
-    _geometry("chain-hundred", "every joint turned by 100 rad", "ulp", 64, CHAIN, partial(_chain, 100.0)),
-    _geometry("blend-opposing", "an even blend of two joints 180° apart: points collapse on the axis", "ulp", 2,
-              "a mean of two numbers", partial(_opposing, 0.0)),
-    _geometry("blend-nearly-opposing", "the same, 1e-6 rad short of 180°", "ulp", 2, "a mean of two numbers",
-              partial(_opposing, 1e-6)),
-    _geometry("wrist-180", "a wrist turned by 180°: no vertex moves away from the bone", "at most", 1e-12,
-              "m; a mean of points on a circle lies inside it, up to rounding", _wrist_twist),
-    _geometry("zju-root-pi", "ZJU-MoCap's root and back, turned by π, 300 m away", "ulp", 4,
-              "two sums and a product, at 300 m", partial(_zju_root, math.pi)),
+    _geometry("chain-pi", "every joint turned by π", partial(_chain, math.pi), "ulp", 64, CHAIN),
+    _geometry("chain-hundred", "every joint turned by 100 rad", partial(_chain, 100.0), "ulp", 64, CHAIN),
+    _geometry("blend-opposing", "an even blend of two joints 180° apart: points collapse on the axis",
+              partial(_opposing, 0.0), "ulp", 2, "a mean of two numbers"),
+    _geometry("blend-nearly-opposing", "the same, 1e-6 rad short of 180°", partial(_opposing, 1e-6), "ulp", 2,
+              "a mean of two numbers"),
+    _geometry("wrist-180", "a wrist turned by 180°: no vertex moves away from the bone", _wrist_twist, "at most",
+              1e-12, "m; a mean of points on a circle lies inside it, up to rounding"),
+    _geometry("zju-root-pi", "ZJU-MoCap's root and back, turned by π, 300 m away", partial(_zju_root, math.pi), "ulp",
+              4, "two sums and a product, at 300 m"),
     *(
-        _geometry(f"betas-{size:g}", f"shape coefficients of ±{size:g}", "ulp", 16, LINEAR,
-                  partial(_extreme_betas, size))
+        _geometry(f"betas-{size:g}", f"shape coefficients of ±{size:g}", partial(_extreme_betas, size), "ulp", 16,
+                  LINEAR)
         for size in (10.0, 1e4)
     ),
-    _geometry("betas-surplus", "one coefficient more than the body has", "words", 0, "it must be refused",
-              _surplus_betas),
-    _geometry("pose-nan", "a pose of NaN", "absolute", 0, EXACT, _nan_pose),
-    _geometry("triangle-no-area", "three corners on a line", "absolute", 0, EXACT,
-              partial(_pixels, [[0, 0, 2], [16, 16, 2], [32, 32, 2]], 0)),
-    _geometry("triangle-nan", "a corner of NaN", "absolute", 0, EXACT,
-              partial(_pixels, [[math.nan, 0, 2], *BIG[1:]], 0)),
-    _geometry("triangle-inf", "a corner at infinity", "absolute", 0, EXACT,
-              partial(_pixels, [[math.inf, 0, 2], *BIG[1:]], 0)),
-    _geometry("triangle-on-near", "a corner on the near plane", "absolute", 0, EXACT, partial(_at_near, NEAR, True)),
-    _geometry("triangle-behind-near", "a corner just behind the near plane", "absolute", 0, EXACT,
-              partial(_at_near, float(np.nextafter(NEAR, 0)), False)),
-    _geometry("triangle-sliver", "2e-9 px across, 64 px along", "ulp", 1, FLOAT32, partial(_sliver, 1e-9)),
-    _geometry("triangle-huge", "corners 1e9 px away", "ulp", 1, FLOAT32, _huge_triangle),
-    _geometry("triangle-coincident", "two faces in one place", "absolute", 0, EXACT, _coincident),
-    _geometry("triangle-shared-edge", "an edge through pixel centres", "absolute", 0, EXACT, _shared_edge),
-    _geometry("triangle-twins", "numpy against numba on 2000 wild triangles", "absolute", 0, BITS, _twins_on_noise),
-    _geometry("normals-no-area", "vertices whose faces have no area", "absolute", 0, EXACT, _normals_without_area),
-    _geometry("uv-texel-centres", "where barycentrics put every texel", "ulp", 64,
-              "a sliver of the atlas has a condition number of hundreds; most is lost and found again in the sum",
-              _texel_coordinates),
-    _geometry("uv-seams", "barycentrics at the seams lie in 0..1", "at most", 1e-9,
-              "the z-buffer decides on inside in px of 1/128, the barycentrics are taken in uv", _seams),
-    _geometry("uv-constant-map", "a map of one value, sampled on and beyond the edges", "ulp", 2,
-              "weights that sum to 1 within an ulp", _constant_map),
-    _geometry("uv-empty-atlas", "padding of charts that are not there", "absolute", 0, EXACT, _empty_atlas),
-    _geometry("camera-focal-1e5", "a focal length of 1e5 px at 150 m", "ulp", 8, RATIONAL, _long_lens),
-    _geometry("camera-far-world", "a studio 1000 km from the origin", "ulp", 8, RATIONAL, _far_world),
-    _geometry("camera-grazing", "a point 1 µm before the camera plane", "ulp", 8, RATIONAL, _grazing),
-    _geometry("camera-on-plane", "points of depth 0", "absolute", 0, EXACT, _on_the_plane),
-    _geometry("camera-behind", "a triangle behind the camera", "absolute", 0, EXACT, _behind),
-    _geometry("camera-inside-box", "the camera inside the body's box", "absolute", 0, EXACT, _box_around_the_camera),
-    _geometry("camera-strong-lens", "distortion at 5 focal lengths off the axis", "ulp", 8,
-              "a polynomial of degree 7, in ulps of the sum of its terms' sizes", _strong_lens),
-    _geometry("camera-resampled", "half the image size at a focal length of 1e5 px", "ulp", 0,
-              "powers of two commute with rounding", _resampled),
-    _geometry("camera-straight-down", "looking along its own up", "words", 0, "it must be refused", _straight_down),
-    _geometry("camera-nan", "an intrinsic matrix of NaN", "words", 0, "it must be refused", _nan_camera),
+    _refused("betas-surplus", "one coefficient more than the body has", _surplus_betas),
+    _exact("pose-nan", "a pose of NaN", _nan_pose),
+    _exact("triangle-no-area", "three corners on a line", partial(_pixels, [[0, 0, 2], [16, 16, 2], [32, 32, 2]], 0)),
+    _exact("triangle-nan", "a corner of NaN", partial(_pixels, [[math.nan, 0, 2], *BIG[1:]], 0)),
+    _exact("triangle-inf", "a corner at infinity", partial(_pixels, [[math.inf, 0, 2], *BIG[1:]], 0)),
+    _exact("triangle-on-near", "a corner on the near plane", partial(_at_near, NEAR, True)),
+    _exact("triangle-behind-near", "a corner just behind the near plane",
+           partial(_at_near, float(np.nextafter(NEAR, 0)), False)),
+    _geometry("triangle-sliver", "2e-9 px across, 64 px along", partial(_sliver, 1e-9), "ulp", 1, FLOAT32),
+    _geometry("triangle-huge", "corners 1e9 px away", _huge_triangle, "ulp", 1, FLOAT32),
+    _exact("triangle-coincident", "two faces in one place", _coincident),
+    _exact("triangle-shared-edge", "an edge through pixel centres", _shared_edge),
+    _geometry("triangle-twins", "numpy against numba on 2000 wild triangles", _twins_on_noise, "absolute", 0, BITS),
+    _exact("normals-no-area", "vertices whose faces have no area", _normals_without_area),
+    _geometry("uv-texel-centres", "where barycentrics put every texel", _texel_coordinates, "ulp", 64,
+              "a sliver of the atlas has a condition number of hundreds; most is lost and found again in the sum"),
+    _geometry("uv-seams", "barycentrics at the seams lie in 0..1", _seams, "at most", 1e-9,
+              "the z-buffer decides on inside in px of 1/128, the barycentrics are taken in uv"),
+    _geometry("uv-constant-map", "a map of one value, sampled on and beyond the edges", _constant_map, "ulp", 2,
+              "weights that sum to 1 within an ulp"),
+    _exact("uv-empty-atlas", "padding of charts that are not there",
+           lambda: Answer(chart_padding(np.zeros((8, 8), np.bool_), 3), -1)),
+    _camera("camera-focal-1e5", "a focal length of 1e5 px at 150 m", _long_lens),
+    _camera("camera-far-world", "a studio 1000 km from the origin", _far_world),
+    _camera("camera-grazing", "a point 1 µm before the camera plane",
+            partial(_projected, front_camera(500.0), (1e-7, -2e-7, 1e-6))),
+    _exact("camera-on-plane", "points of depth 0", _on_the_plane),
+    _exact("camera-behind", "a triangle behind the camera", _behind),
+    _exact("camera-inside-box", "the camera inside the body's box", _box_around_the_camera),
+    _geometry("camera-strong-lens", "distortion at 5 focal lengths off the axis", _strong_lens, "ulp", 8,
+              "a polynomial of degree 7, in ulps of the sum of its terms' sizes"),
+    _geometry("camera-resampled", "half the image size at a focal length of 1e5 px", _resampled, "ulp", 0,
+              "powers of two commute with rounding"),
+    _refused("camera-straight-down", "looking along its own up", _straight_down),
+    _refused("camera-nan", "an intrinsic matrix of NaN", _nan_camera),
 ]  # fmt: skip

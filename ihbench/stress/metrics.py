@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -18,7 +17,7 @@ from ihbench.metrics.oracles.flip_oracle import flip_oracle
 from ihbench.metrics.oracles.oracle import psnr_oracle, ssim_oracle
 from ihbench.metrics.psnr import mean_of_channels
 from ihbench.metrics.statistics import mean_interval, paired_test, smallest_detectable_difference
-from ihbench.stress.case import Answer, Case, Unit
+from ihbench.stress.case import Answer, Case
 
 EXACT = "the definition gives this number and no other"
 CLOSED = "a closed form; the sum over the pixels rounds each term once, the logarithm once more"
@@ -27,6 +26,7 @@ ORACLE = "both sum in float64; only the order of the sums differs"
 ORACLE_FLIP = "both work in float64; powers of 0.5 and 0.7 lift rounding errors where FLIP is near 0"
 FLOAT32 = "the training loss works in float32: 6e-8 a step, some 20 steps, on sums centred on half the range"
 
+PSNR_FULL = "psnr/pooled/range1/full/v1"
 METRICS = {"psnr": psnr, "ssim": ssim, "flip": flip}
 ORACLES = {"psnr": psnr_oracle, "ssim": ssim_oracle, "flip": flip_oracle}
 PERFECT = {"psnr": math.inf, "ssim": 1.0, "flip": 0.0}
@@ -134,10 +134,6 @@ def _one_pixel_psnr() -> Answer:
     return Answer(psnr(x, y, mask), expected)
 
 
-def _one_pixel(metric: str) -> Answer:
-    return _against_oracle(metric, texture(1), texture(2), rectangle(slice(19, 20), slice(0, 1)))
-
-
 def _bad_inside(metric: str, bad: float) -> Answer:
     x = texture(1)
     x[5, 6, 1] = bad
@@ -153,25 +149,8 @@ def _bad_outside(metric: str, bad: float) -> Answer:
     return Answer(METRICS[metric](x, y, mask), clean)
 
 
-def _hdr() -> Answer:
-    x, y = texture(1) * 1e4, texture(2)
-    return _against_oracle("psnr", x, y)
-
-
-def _half_overflow() -> Answer:
-    """60000² is beyond float16."""
-    x, y = flat(6e4, dtype=np.float16), flat(0, dtype=np.float16)
-    return Answer(psnr(x, y, hdr=True), -20 * math.log10(float(np.float16(6e4))))
-
-
-def _double_overflow() -> Answer:
-    """(1e200)² is beyond float64."""
-    return Answer(psnr(flat(1e200), flat(0), hdr=True), -4000.0)
-
-
-def _below_double() -> Answer:
-    """(1e-170)² is below float64: an error that is there must not become none."""
-    return Answer(psnr(flat(1e-170), flat(0), hdr=True), 3400.0)
+def _flat_on_black(level: float, expected: float, dtype: type = np.float64) -> Answer:
+    return Answer(psnr(flat(level, dtype=dtype), flat(0, dtype=dtype), hdr=True), expected)
 
 
 def _tiny_on_large(amplitude: float) -> tuple[NDArray, NDArray]:
@@ -217,10 +196,6 @@ def _half_precision(metric: str, name: str) -> Answer:
     return Answer(METRICS[metric](*images), ORACLES[metric](*exact))
 
 
-def _sized(metric: str, height: int, width: int) -> Answer:
-    return _against_oracle(metric, texture(1, height, width), texture(2, height, width))
-
-
 def _negative_ssim() -> Answer:
     """A checkerboard against its negative."""
     board = (np.indices((20, 18)).sum(0) % 2)[..., None].repeat(3, 2).astype(np.float64)
@@ -243,13 +218,9 @@ def _order_of_sums() -> Answer:
 
 
 def _infinite_frames() -> Answer:
-    scores = [Score(v, "psnr/pooled/range1/full/v1") for v in (math.inf, 20.0, 30.0)]
+    scores = [Score(v, PSNR_FULL) for v in (math.inf, 20.0, 30.0)]
     mean = mean_over_frames(scores)
     return Answer([mean.value, mean.infinite, mean.n], [25.0, 1, 2])
-
-
-def _all_frames_infinite() -> Answer:
-    return Answer(mean_over_frames([Score(math.inf, "psnr/pooled/range1/full/v1")] * 3).value, math.inf)
 
 
 def _intervals() -> Answer:
@@ -261,119 +232,97 @@ def _intervals() -> Answer:
     return Answer(found, [math.nan, 3.0, 3.0, 0.5, 0.0])
 
 
-def _metric(
-    name: str, what: str, unit: Unit, tolerance: float, why: str, function: Callable[[], Answer], known: str = ""
-) -> Case:
-    return Case(name, "metrics", what, unit, tolerance, why, function, known)
+_metric = partial(Case, group="metrics")
+_exact = partial(_metric, unit="absolute", tolerance=0, why=EXACT)
+_closed = partial(_metric, unit="ulp", tolerance=64, why=CLOSED)
+_oracle = partial(_metric, unit="absolute", tolerance=1e-12, why=ORACLE)
 
 
 CASES = [
     *(
-        _metric(f"{m}-identical-{t.__name__}", "an image and its copy", "absolute", 0, EXACT,
-                partial(_identical, m, t))
+        _exact(f"{m}-identical-{t.__name__}", "an image and its copy", partial(_identical, m, t))
         for m in METRICS
         for t in (np.uint8, np.float16)
     ),
     *(
-        _metric(
-            f"psnr-one-step-{t.__name__}", "one value moves to the next number of its type", "ulp", 4, CLOSED,
-            partial(_one_step, t),
-        )
+        _metric(f"psnr-one-step-{t.__name__}", "one value moves to the next number of its type",
+                partial(_one_step, t), "ulp", 4, CLOSED)
         for t in (np.uint8, np.float16, np.float32, np.float64)
     ),
-    _metric("ssim-one-lsb", "one value changes by 1/255", "absolute", 1e-12, ORACLE,
-            partial(_one_lsb_oracle, "ssim")),
-    _metric(
-        "flip-one-lsb", "one value changes by 1/255", "absolute", 1e-9, ORACLE_FLIP, partial(_one_lsb_oracle, "flip")
-    ),
+    _oracle("ssim-one-lsb", "one value changes by 1/255", partial(_one_lsb_oracle, "ssim")),
+    _metric("flip-one-lsb", "one value changes by 1/255", partial(_one_lsb_oracle, "flip"), "absolute", 1e-9,
+            ORACLE_FLIP),
     *(
-        _metric(f"psnr-constant-{t.__name__}", "two flat images", "ulp", 64, CLOSED, partial(_constant_psnr, t))
+        _closed(f"psnr-constant-{t.__name__}", "two flat images", partial(_constant_psnr, t))
         for t in (np.uint8, np.float32)
     ),
     *(
-        _metric(f"ssim-constant-{t.__name__}", "two flat images", "absolute", 1e-12, FLAT, partial(_constant_ssim, t))
+        _metric(f"ssim-constant-{t.__name__}", "two flat images", partial(_constant_ssim, t), "absolute", 1e-12, FLAT)
         for t in (np.uint8, np.float16)
     ),
-    _metric("flip-green-blue", "the two colours that FLIP is scaled by", "absolute", 1e-12, CLOSED, _green_and_blue),
-    _metric(
-        "flip-black-white", "black against white", "absolute", 1e-12, ORACLE,
-        lambda: _against_oracle("flip", flat(0, 8, 8), flat(1, 8, 8)),
-    ),
+    _metric("flip-green-blue", "the two colours that FLIP is scaled by", _green_and_blue, "absolute", 1e-12, CLOSED),
+    _oracle("flip-black-white", "black against white", lambda: _against_oracle("flip", flat(0, 8, 8), flat(1, 8, 8))),
+    *(_exact(f"{m}-empty-mask", "a region without a pixel", partial(_empty_mask, m)) for m in METRICS),
+    _metric("psnr-one-pixel-mask", "a region of one pixel in a corner", _one_pixel_psnr, "ulp", 4, CLOSED),
     *(
-        _metric(f"{m}-empty-mask", "a region without a pixel", "absolute", 0, EXACT, partial(_empty_mask, m))
-        for m in METRICS
-    ),
-    _metric("psnr-one-pixel-mask", "a region of one pixel in a corner", "ulp", 4, CLOSED, _one_pixel_psnr),
-    *(
-        _metric(
-            f"{m}-one-pixel-mask", "a region of one pixel in a corner", "absolute", tolerance, why,
-            partial(_one_pixel, m),
-        )
+        _metric(f"{m}-one-pixel-mask", "a region of one pixel in a corner",
+                lambda m=m: _against_oracle(m, texture(1), texture(2), rectangle(slice(19, 20), slice(0, 1))),
+                "absolute", tolerance, why)
         for m, tolerance, why in (("ssim", 1e-12, ORACLE), ("flip", 1e-9, ORACLE_FLIP))
     ),
-    _metric(
-        "ssim-mask-below-window", "a region of 3×3 px under a window of 11×11", "absolute", 1e-12, ORACLE,
-        lambda: _against_oracle("ssim", texture(1), texture(2), rectangle(slice(7, 10), slice(7, 10))),
-    ),
+    _oracle("ssim-mask-below-window", "a region of 3×3 px under a window of 11×11",
+            lambda: _against_oracle("ssim", texture(1), texture(2), rectangle(slice(7, 10), slice(7, 10)))),
+    *(_exact(f"{m}-nan-inside", "a NaN in the region", partial(_bad_inside, m, math.nan)) for m in METRICS),
+    _exact("psnr-inf-inside", "an infinite pixel in the region", partial(_bad_inside, "psnr", math.inf)),
     *(
-        _metric(f"{m}-nan-inside", "a NaN in the region", "absolute", 0, EXACT, partial(_bad_inside, m, math.nan))
+        _metric(f"{m}-nan-outside", "a NaN beside the region", partial(_bad_outside, m, math.nan), "absolute", 0,
+                "not a bit may change")
         for m in METRICS
     ),
-    _metric("psnr-inf-inside", "an infinite pixel in the region", "absolute", 0, EXACT,
-            partial(_bad_inside, "psnr", math.inf)),
-    *(
-        _metric(
-            f"{m}-nan-outside", "a NaN beside the region", "absolute", 0, "not a bit may change",
-            partial(_bad_outside, m, math.nan),
-        )
-        for m in METRICS
-    ),
-    _metric("ssim-inf-outside", "an infinite pixel beside the region", "absolute", 0, "not a bit may change",
-            partial(_bad_outside, "ssim", -math.inf)),
-    _metric("psnr-hdr", "values up to 10000", "relative", 1e-14, ORACLE, _hdr),
-    _metric("psnr-float16-overflow", "60000 in float16, whose square float16 lacks", "ulp", 64, CLOSED,
-            _half_overflow),
-    _metric(
-        "psnr-float64-overflow", "1e200, whose square float64 lacks", "ulp", 64, CLOSED, _double_overflow,
-        known="squares of errors above 1e154 overflow; the score is then absent (NaN), which no real image reaches",
-    ),
-    _metric("psnr-float64-underflow", "an error of 1e-170, whose square float64 lacks", "ulp", 64, CLOSED,
-            _below_double,
+    _metric("ssim-inf-outside", "an infinite pixel beside the region", partial(_bad_outside, "ssim", -math.inf),
+            "absolute", 0, "not a bit may change"),
+    _metric("psnr-hdr", "values up to 10000", lambda: _against_oracle("psnr", texture(1) * 1e4, texture(2)),
+            "relative", 1e-14, ORACLE),
+    _closed("psnr-float16-overflow", "60000 in float16, whose square float16 lacks",
+            partial(_flat_on_black, 6e4, -20 * math.log10(6e4), np.float16)),
+    _closed("psnr-float64-overflow", "1e200, whose square float64 lacks", partial(_flat_on_black, 1e200, -4000.0),
+            known="squares of errors above 1e154 overflow; the score is then absent (NaN), "
+                  "which no real image reaches"),
+    _closed("psnr-float64-underflow", "an error of 1e-170, whose square float64 lacks",
+            partial(_flat_on_black, 1e-170, 3400.0),
             known="squares of errors below 1e-162 are 0, and the images count as identical (inf)"),
-    _metric(
-        "psnr-cancellation", "every pixel off by 2^-40 on a mean of 1", "ulp", 64,
-        "both differences are exact, whatever the condition number says", _tiny_difference,
-    ),
+    _metric("psnr-cancellation", "every pixel off by 2^-40 on a mean of 1", _tiny_difference, "ulp", 64,
+            "both differences are exact, whatever the condition number says"),
     *(
-        _metric(
-            f"ssim-tiny-variance-{a:g}", f"patterns of amplitude {a:g} on a mean of 1", "absolute", 1e-11,
-            "E[s²] - E[s]² leaves 1e-16 × E[s²] against 2 C2 = 2e-3", partial(
-                lambda a: _against_oracle("ssim", *_tiny_on_large(a)), a),
-        )
+        _metric(f"ssim-tiny-variance-{a:g}", f"patterns of amplitude {a:g} on a mean of 1",
+                lambda a=a: _against_oracle("ssim", *_tiny_on_large(a)), "absolute", 1e-11,
+                "E[s²] - E[s]² leaves 1e-16 × E[s²] against 2 C2 = 2e-3")
         for a in (1 / 255, 1e-6, 1e-12)
     ),
-    _metric("ssim-loss-tiny-variance", "the training loss in float32, amplitude 1/255 on a mean of 1", "absolute",
-            1e-5, FLOAT32 + "; of squares near 1 it keeps 6e-8, against 2 C2 = 2e-3", _training_ssim),
-    _metric("ssim-loss-flat-gradient", "the gradient where both images are equal and flat", "absolute", 1e-6, FLOAT32,
-            _training_ssim_gradient),
+    _metric("ssim-loss-tiny-variance", "the training loss in float32, amplitude 1/255 on a mean of 1", _training_ssim,
+            "absolute", 1e-5, FLOAT32 + "; of squares near 1 it keeps 6e-8, against 2 C2 = 2e-3"),
+    _metric("ssim-loss-flat-gradient", "the gradient where both images are equal and flat", _training_ssim_gradient,
+            "absolute", 1e-6, FLOAT32),
     *(
-        _metric(f"{m}-{t}", "images rounded to half precision", "relative", 1e-12, ORACLE,
-                partial(_half_precision, m, t))
+        _metric(f"{m}-{t}", "images rounded to half precision", partial(_half_precision, m, t), "relative", 1e-12,
+                ORACLE)
         for m in ("psnr", "ssim")
         for t in ("float16", "bfloat16")
     ),
     *(
-        _metric(f"{m}-{h}x{w}", f"images of {h}×{w} px", "absolute", tolerance, why, partial(_sized, m, h, w))
+        _metric(f"{m}-{h}x{w}", f"images of {h}×{w} px",
+                lambda m=m, h=h, w=w: _against_oracle(m, texture(1, h, w), texture(2, h, w)),
+                "absolute", tolerance, why)
         for m, tolerance, why in (("psnr", 1e-12, ORACLE), ("ssim", 1e-12, ORACLE), ("flip", 1e-9, ORACLE_FLIP))
         for h, w in ((1, 1), (1, 7))
     ),
-    _metric("ssim-negative", "a checkerboard against its negative", "absolute", 1e-12, ORACLE, _negative_ssim),
-    _metric("psnr-one-perfect-channel", "channel PSNRs, one channel without error", "absolute", 0, EXACT,
-            _one_perfect_channel),
-    _metric("psnr-order-of-sums", "a million 8-bit pixels", "ulp", 1,
-            "integers add up exactly; one division and one logarithm round", _order_of_sums),
-    _metric("mean-infinite-frames", "one of three frames has no error", "absolute", 0, EXACT, _infinite_frames),
-    _metric("mean-all-infinite", "no frame has an error", "absolute", 0, EXACT, _all_frames_infinite),
-    _metric("intervals-few-subjects", "one subject, equal subjects, two subjects", "absolute", 1e-15, EXACT,
-            _intervals),
+    _oracle("ssim-negative", "a checkerboard against its negative", _negative_ssim),
+    _exact("psnr-one-perfect-channel", "channel PSNRs, one channel without error", _one_perfect_channel),
+    _metric("psnr-order-of-sums", "a million 8-bit pixels", _order_of_sums, "ulp", 1,
+            "integers add up exactly; one division and one logarithm round"),
+    _exact("mean-infinite-frames", "one of three frames has no error", _infinite_frames),
+    _exact("mean-all-infinite", "no frame has an error",
+           lambda: Answer(mean_over_frames([Score(math.inf, PSNR_FULL)] * 3).value, math.inf)),
+    _metric("intervals-few-subjects", "one subject, equal subjects, two subjects", _intervals, "absolute", 1e-15,
+            EXACT),
 ]  # fmt: skip

@@ -224,7 +224,7 @@ KEPT = ("no 8-bit rounding", "gauhuman", "instantavatar")  # the order of these 
 def _ranking(kind: str, choice: str, why: str, function: Callable[[str], Answer], known: str = "") -> Case:
     named = choice.replace(" ", "-")
     what = f"under the preset {choice}" if choice in PRESETS else f"under {choice}"
-    return Case(f"{kind}-{named}", "ranking", what, "absolute", 0, why, partial(function, choice), known)
+    return Case(f"{kind}-{named}", what, partial(function, choice), "absolute", 0, why, "ranking", known)
 
 
 CASES = [

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.camera import Camera
-from ihbench.stress.case import Answer, Case, Unit, words_of
+from ihbench.stress.case import Answer, Case, words_of
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -19,6 +18,8 @@ if TYPE_CHECKING:
 BACKENDS = ("reference", "numba")
 # what the renderer is defined to do (Kerbl et al. 2023, released code); not imported, so that a change is noticed
 NEAR, LOW_PASS, ALPHA_MAX, ALPHA_MIN = 0.01, 0.3, 0.999, 1 / 255
+
+NOTHING = [1.0, 1.0, 1.0, 0.0]  # white, without alpha
 
 FLOAT32 = "the fast back end draws in float32: one exponential, one product and one sum a layer"
 STACK = "the fast back end leaves out what lies behind a transmittance of 1e-5"
@@ -66,9 +67,9 @@ def _one(scale: float, mean: tuple[float, float, float] = (0.013, -0.021, 2.0), 
     return Answer(np.stack(draw([mean], [scale], [[0.2, 0.5, 0.9]], view))[..., 3], alpha, condition)
 
 
-def _not_drawn(mean: tuple[float, float, float], scale: float = 0.1, color: float = 0.5) -> Answer:
+def _not_drawn(mean: tuple[float, float, float], scale: float = 0.1) -> Answer:
     """Nothing but background."""
-    return Answer(np.stack(draw([mean], [scale], [[color] * 3])), [1.0, 1.0, 1.0, 0.0])
+    return Answer(np.stack(draw([mean], [scale], [[0.5] * 3])), NOTHING)
 
 
 def _barely_before(factor: float) -> Answer:
@@ -76,10 +77,6 @@ def _barely_before(factor: float) -> Answer:
     z = float(np.float32(NEAR)) * factor
     alpha = ALPHA_MAX if factor > 1 else 0.0
     return Answer(np.stack(draw([[0.0, 0.0, z]], [0.1], [[0.5] * 3]))[..., 3], alpha)
-
-
-def _none_at_all() -> Answer:
-    return Answer(np.stack(draw(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)))), [1.0, 1.0, 1.0, 0.0])
 
 
 def _nothing_to_move() -> Answer:
@@ -182,10 +179,10 @@ def _negative_scale() -> Answer:
     return Answer(words_of(ValueError, lambda: draw(means, np.log(scales), colors)), "go through exp()")
 
 
-def _size(width: int, height: int) -> Answer:
-    """An image that ends inside a tile: numba against the float64 twin."""
-    twin, fast = draw(*_cloud(60), camera(width, height))
-    return Answer(fast, twin)
+def _twins(*scene: Any, scale: float | None = None, **options: Any) -> Answer:
+    """Numba against the float64 twin."""
+    twin, fast = draw(*scene, **options)
+    return Answer(fast, twin, scale=scale)
 
 
 def _permuted() -> Answer:
@@ -213,15 +210,13 @@ def _threads() -> Answer:
 def _hdr() -> Answer:
     """Colours of 1e4: errors are relative to them."""
     means, scales, colors = _cloud(60)
-    twin, fast = draw(means, scales, colors * 1e4)
-    return Answer(fast, twin, scale=1e4)
+    return _twins(means, scales, colors * 1e4, scale=1e4)
 
 
 def _channels(count: int) -> Answer:
     means, scales, _ = _cloud(60)
     colors = np.random.default_rng(2).uniform(size=(60, count))
-    twin, fast = draw(means, scales, colors, background=(0.3,))
-    return Answer(fast, twin)
+    return _twins(means, scales, colors, background=(0.3,))
 
 
 def _half() -> Answer:
@@ -290,68 +285,65 @@ def _distorted() -> Answer:
     return Answer(words_of(ValueError, lambda: draw(*_cloud(2), lens)), "expected no lens distortion")
 
 
-def _splat(name: str, what: str, unit: Unit, tolerance: float, why: str, function: Callable[[], Answer]) -> Case:
-    return Case(name, "splat", what, unit, tolerance, why, function)
+_splat = partial(Case, group="splat")
+_exact = partial(_splat, unit="absolute", tolerance=0, why=EXACT)
+_single = partial(_splat, unit="absolute", tolerance=2e-6, why=FLOAT32)
+_same_bits = partial(_splat, unit="absolute", tolerance=0, why=BITS)
 
 
 CASES = [
-    _splat("splat-plain", "a Gaussian of 2 px", "absolute", 2e-6, FLOAT32, partial(_one, 0.1)),
-    _splat("splat-sub-pixel", "a scale of 1e-6 m: only the low-pass is left", "absolute", 2e-6, FLOAT32,
-           partial(_one, 1e-6)),
-    _splat("splat-zero-scale", "a scale of 0", "absolute", 2e-6, FLOAT32, partial(_one, 0.0)),
-    _splat("splat-huge", "a scale of 1 km: the clamp everywhere", "absolute", 2e-6, FLOAT32, partial(_one, 1e3)),
-    _splat("splat-huge-1e15", "a footprint of 1e33 px², which float32 just holds", "absolute", 2e-6, FLOAT32,
-           partial(_one, 1e15)),
-    _splat("splat-overflow", "a footprint that float32 lacks is not drawn", "absolute", 0, EXACT,
+    _single("splat-plain", "a Gaussian of 2 px", partial(_one, 0.1)),
+    _single("splat-sub-pixel", "a scale of 1e-6 m: only the low-pass is left", partial(_one, 1e-6)),
+    _single("splat-zero-scale", "a scale of 0", partial(_one, 0.0)),
+    _single("splat-huge", "a scale of 1 km: the clamp everywhere", partial(_one, 1e3)),
+    _single("splat-huge-1e15", "a footprint of 1e33 px², which float32 just holds", partial(_one, 1e15)),
+    _exact("splat-overflow", "a footprint that float32 lacks is not drawn",
            partial(_not_drawn, (0.0, 0.0, 2.0), 1e19)),
-    _splat("splat-focal-1e5", "a focal length of 1e5 px at 100 m", "absolute", 2e-6, FLOAT32,
-           partial(_one, 1e-3, (0.004, -0.003, 100.0), 1e5)),
-    _splat("splat-far-away", "a Gaussian at 1e7 m", "absolute", 2e-6, FLOAT32, partial(_one, 1e5, (3e5, -2e5, 1e7))),
-    _splat("splat-alpha-ceiling", "the middle of an opaque Gaussian lets 1/1000 through", "absolute", 2e-6, FLOAT32,
-           partial(_one, 0.5, (0.0, 0.0, 2.0))),
-    _splat("splat-behind", "a centre behind the camera", "absolute", 0, EXACT, partial(_not_drawn, (0.0, 0.0, -2.0))),
-    _splat("splat-on-camera", "a centre in the camera", "absolute", 0, EXACT, partial(_not_drawn, (0.0, 0.0, 0.0))),
-    _splat("splat-before-near", "an ulp of float32 before the near plane", "absolute", 2e-6, FLOAT32,
-           partial(_barely_before, 1 + 2.0**-22)),
-    _splat("splat-behind-near", "an ulp of float32 behind the near plane", "absolute", 0, EXACT,
-           partial(_barely_before, 1 - 2.0**-22)),
-    _splat("splat-beside", "a centre far beside the image", "absolute", 0, EXACT,
-           partial(_not_drawn, (50.0, 0.0, 2.0))),
-    _splat("splat-none", "no Gaussian at all", "absolute", 0, EXACT, _none_at_all),
-    _splat("splat-all-behind-gradient", "gradients when all are behind", "absolute", 0, EXACT, _nothing_to_move),
-    _splat("splat-stack-100", "100 opaque layers over one pixel", "absolute", 1.2e-5, STACK, partial(_stack, 100)),
-    _splat("splat-stack-10000", "10000 opaque layers over one pixel", "absolute", 1.2e-5, STACK,
-           partial(_stack, 10_000)),
-    _splat("splat-stack-thin", "2000 layers at 1.05 times the alpha threshold", "absolute", 2e-5,
-           STACK + "; 2000 products in float32", partial(_thin_stack, 2000)),
-    _splat("splat-coincident", "two centres in one place", "absolute", 2e-6, FLOAT32, partial(_coincident, 0.0)),
-    _splat("splat-depth-tie", "two depths that float32 cannot tell apart", "absolute", 2e-6, FLOAT32,
-           partial(_coincident, 1e-8)),
+    _single("splat-focal-1e5", "a focal length of 1e5 px at 100 m", partial(_one, 1e-3, (0.004, -0.003, 100.0), 1e5)),
+    _single("splat-far-away", "a Gaussian at 1e7 m", partial(_one, 1e5, (3e5, -2e5, 1e7))),
+    _single("splat-alpha-ceiling", "the middle of an opaque Gaussian lets 1/1000 through",
+            partial(_one, 0.5, (0.0, 0.0, 2.0))),
+    _exact("splat-behind", "a centre behind the camera", partial(_not_drawn, (0.0, 0.0, -2.0))),
+    _exact("splat-on-camera", "a centre in the camera", partial(_not_drawn, (0.0, 0.0, 0.0))),
+    _single("splat-before-near", "an ulp of float32 before the near plane", partial(_barely_before, 1 + 2.0**-22)),
+    _exact("splat-behind-near", "an ulp of float32 behind the near plane", partial(_barely_before, 1 - 2.0**-22)),
+    _exact("splat-beside", "a centre far beside the image", partial(_not_drawn, (50.0, 0.0, 2.0))),
+    _exact("splat-none", "no Gaussian at all",
+           lambda: Answer(np.stack(draw(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)))), NOTHING)),
+    _exact("splat-all-behind-gradient", "gradients when all are behind", _nothing_to_move),
+    _splat("splat-stack-100", "100 opaque layers over one pixel", partial(_stack, 100), "absolute", 1.2e-5, STACK),
+    _splat("splat-stack-10000", "10000 opaque layers over one pixel", partial(_stack, 10_000), "absolute", 1.2e-5,
+           STACK),
+    _splat("splat-stack-thin", "2000 layers at 1.05 times the alpha threshold", partial(_thin_stack, 2000),
+           "absolute", 2e-5, STACK + "; 2000 products in float32"),
+    _single("splat-coincident", "two centres in one place", partial(_coincident, 0.0)),
+    _single("splat-depth-tie", "two depths that float32 cannot tell apart", partial(_coincident, 1e-8)),
     *(
-        _splat(f"splat-bad-{what}", f"one {what} of {bad} among 40 Gaussians", "absolute", 0,
-               "the same Gaussians in the same order", partial(_one_bad, field, bad))
+        _splat(f"splat-bad-{what}", f"one {what} of {bad} among 40 Gaussians", partial(_one_bad, field, bad),
+               "absolute", 0, "the same Gaussians in the same order")
         for what, field, bad in (("mean", 0, math.nan), ("scale", 1, math.inf), ("colour", 2, math.nan))
     ),
-    _splat("splat-bad-gradient", "gradients beside a centre of NaN", "absolute", 1e-12,
-           "float64 in the twin, the same float32 sums in the fast one", _bad_gradient),
-    Case("splat-negative-scale", "splat", "logarithms of scales", "words", 0, "they must be refused", _negative_scale,
-         version=2),
+    _splat("splat-bad-gradient", "gradients beside a centre of NaN", _bad_gradient, "absolute", 1e-12,
+           "float64 in the twin, the same float32 sums in the fast one"),
+    _splat("splat-negative-scale", "logarithms of scales", _negative_scale, "words", 0, "they must be refused",
+           version=2),
     *(
-        _splat(f"splat-{w}x{h}", f"an image of {w}×{h} px", "absolute", 1e-5, FLOAT32, partial(_size, w, h))
+        _splat(f"splat-{w}x{h}", f"an image of {w}×{h} px", lambda w=w, h=h: _twins(*_cloud(60), camera(w, h)),
+               "absolute", 1e-5, FLOAT32)
         for w, h in ((1, 1), (17, 33))
     ),
-    _splat("splat-permuted", "another order of the input", "absolute", 0, BITS, _permuted),
-    _splat("splat-threads", "gradients on one thread and on two", "absolute", 0, BITS, _threads),
-    _splat("splat-hdr", "colours of 10000", "relative", 1e-5, FLOAT32, _hdr),
-    _splat("splat-64-channels", "colours of 64 channels", "absolute", 1e-5, FLOAT32, partial(_channels, 64)),
-    _splat("splat-float16", "inputs in half precision", "absolute", 1e-3, "the picture is rounded to float16", _half),
-    _splat("splat-white-on-black", "white on black is alpha", "absolute", 2e-6, FLOAT32, _white_on_black),
-    _splat("splat-far-world", "a scene 1000 km from the origin", "absolute", 1e-5,
-           FLOAT32 + "; a centre keeps 1e-10 m of 1e6", _far_world),
-    _splat("splat-backward", "gradients of 4000 Gaussians against the twin", "absolute", 2e-5, GRADIENT,
-           partial(_backward, 0)),
-    _splat("splat-saturated-gradient", "gradients under the alpha clamp", "absolute", 1e-6, FLOAT32,
-           _saturated_gradient),
-    _splat("splat-zero-scale-gradient", "the gradient of a scale of 0", "absolute", 0, EXACT, _no_scale_gradient),
-    _splat("splat-distorted-camera", "a camera with lens distortion", "words", 0, "it must be refused", _distorted),
+    _same_bits("splat-permuted", "another order of the input", _permuted),
+    _same_bits("splat-threads", "gradients on one thread and on two", _threads),
+    _splat("splat-hdr", "colours of 10000", _hdr, "relative", 1e-5, FLOAT32),
+    _splat("splat-64-channels", "colours of 64 channels", partial(_channels, 64), "absolute", 1e-5, FLOAT32),
+    _splat("splat-float16", "inputs in half precision", _half, "absolute", 1e-3, "the picture is rounded to float16"),
+    _single("splat-white-on-black", "white on black is alpha", _white_on_black),
+    _splat("splat-far-world", "a scene 1000 km from the origin", _far_world, "absolute", 1e-5,
+           FLOAT32 + "; a centre keeps 1e-10 m of 1e6"),
+    _splat("splat-backward", "gradients of 4000 Gaussians against the twin", partial(_backward, 0), "absolute", 2e-5,
+           GRADIENT),
+    _splat("splat-saturated-gradient", "gradients under the alpha clamp", _saturated_gradient, "absolute", 1e-6,
+           FLOAT32),
+    _exact("splat-zero-scale-gradient", "the gradient of a scale of 0", _no_scale_gradient),
+    _splat("splat-distorted-camera", "a camera with lens distortion", _distorted, "words", 0, "it must be refused"),
 ]  # fmt: skip

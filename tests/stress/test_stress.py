@@ -22,9 +22,9 @@ from ihbench.stress.case import Answer, Case, error_of, words_of
 from ihbench.stress.ranking import flips
 from ihbench.stress.run import all_cases, chosen_cases, run_case, run_cases
 from ihbench.stress.table import failures, summary
-from ihbench.stress.training import told
+from ihbench.stress.training import story_of_fit
 
-OK = Case("fine", "metrics", "a law", "absolute", 0.5, "it is so", lambda: Answer(1.2, 1.0))
+OK = Case("fine", "a law", lambda: Answer(1.2, 1.0), "absolute", 0.5, "it is so", "metrics")
 
 
 @pytest.fixture(scope="module")
@@ -221,13 +221,16 @@ def test_flips_are_pairs_whose_order_is_reversed():
 
 def test_the_story_of_a_fit():
     ledger = Ledger()
-    assert told(lambda: 7, ledger) == (7, "no step rejected")
+    assert story_of_fit(lambda: 7, ledger) == (7, "no step rejected")
     ledger.event(RolledBack("s", 0, "…", 9))
 
     def diverges():
         raise Diverged(12, "loss is nan")
 
-    assert told(diverges, ledger) == (None, "step 9 rejected, back to 0; diverged, first bad step 12: loss is nan")
+    assert story_of_fit(diverges, ledger) == (
+        None,
+        "step 9 rejected, back to 0; diverged, first bad step 12: loss is nan",
+    )
 
 
 # ------------------------------------------------------------------------------------------------ the command

@@ -26,7 +26,7 @@ from ihbench.methods.inpainthuman.stages.stage1 import Stage1, loss_of, prepare_
 from ihbench.scene.contracts import MaskState, TrainingSet, TrainView
 from ihbench.stress.case import Answer, Case, Unit, words_of
 from ihbench.stress.drawn_capture import WHITE, a_camera, a_pose, the_body, train_view
-from ihbench.stress.training import told
+from ihbench.stress.training import story_of_fit
 
 SIZE = 48  # px
 STEPS = 16
@@ -56,8 +56,17 @@ def views() -> tuple[TrainView, ...]:
     )
 
 
-def training_set(chosen: Sequence[TrainView] | None = None) -> TrainingSet:
-    return TrainingSet(list(views() if chosen is None else chosen), the_body(), WHITE, "stress")
+def training_set(shown: Sequence[TrainView] | None = None) -> TrainingSet:
+    return TrainingSet(list(views() if shown is None else shown), the_body(), WHITE, "stress")
+
+
+def with_view(k: int, **changes: Any) -> TrainingSet:
+    return training_set([replace(view, **changes) if j == k else view for j, view in enumerate(views())])
+
+
+def a_person_pixel(k: int) -> tuple[int, ...]:
+    """Row and column of one, in view k."""
+    return tuple(np.argwhere(views()[k].mask == MaskState.PERSON)[9])
 
 
 def mean_loss(avatar: GaussianAvatar, training: TrainingSet) -> float:
@@ -94,22 +103,29 @@ def fitted(
         stage.run(Progress.silent())
         return avatar
 
-    return told(fit, ledger)
+    return story_of_fit(fit, ledger)
 
 
-def _ratio(config: InpaintHumanConfig, training: TrainingSet, start: GaussianAvatar | None = None) -> Answer:
+def _ratio(
+    config: InpaintHumanConfig,
+    training: TrainingSet,
+    start: GaussianAvatar | None = None,
+    prepare: Callable[[Stage1], None] = lambda stage: None,
+) -> Answer:
     """Loss after over loss before."""
     before = mean_loss(start or fresh(config), training)
-    after, story = fitted(config, training, start)
+    after, story = fitted(config, training, start, prepare)
     return Answer(math.nan if after is None else mean_loss(after, training) / before, 1.0, note=story)
+
+
+def with_scale(avatar: GaussianAvatar, raw: float) -> GaussianAvatar:
+    """The avatar, whose decoder asks for a scale factor of e^raw."""
+    avatar.decoder.linear[-1].bias.data[3] = raw
+    return avatar
 
 
 # ----------------------------------------------------------------------------------------------------
 # Step sizes
-
-
-def _rates(factor: float) -> Answer:
-    return _ratio(scaled_rates(factor), training_set())
 
 
 def _absurd_rates() -> Answer:
@@ -145,10 +161,7 @@ def _clipped(factor: float) -> Answer:
         loss = stage._loss
         stage._loss = lambda k: factor * loss(k)
 
-    config = replace(TINY, clip_gradient=1e30)
-    after, story = fitted(config, training_set(), prepare=scale)
-    before = mean_loss(fresh(config), training_set())
-    return Answer(math.nan if after is None else mean_loss(after, training_set()) / before, 1.0, note=story)
+    return _ratio(replace(TINY, clip_gradient=1e30), training_set(), prepare=scale)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -157,21 +170,12 @@ def _clipped(factor: float) -> Answer:
 
 def _scales(raw: float) -> Answer:
     """A fit from Gaussians whose scale factor is e^raw, against the loss that it began with."""
-    import torch
-
-    start = fresh(TINY)
-    with torch.no_grad():
-        start.decoder.linear[-1].bias[3] = raw
-    return _ratio(TINY, training_set(), start)
+    return _ratio(TINY, training_set(), with_scale(fresh(TINY), raw))
 
 
 def _dead_scales(raw: float) -> Answer:
     """The gradient along the scales, where the decoder asks for a factor of e^raw, must not be 0."""
-    import torch
-
-    avatar = fresh(replace(TINY, scale_weight=0.0))
-    with torch.no_grad():
-        avatar.decoder.linear[-1].bias[3] = raw
+    avatar = with_scale(fresh(replace(TINY, scale_weight=0.0)), raw)
     loss_of(avatar, prepare_target(avatar, views()[0]), WHITE).backward()
     bias: Any = avatar.decoder.linear[-1].bias
     return Answer(float(bias.grad[3].abs() > 0), 1.0)
@@ -179,15 +183,11 @@ def _dead_scales(raw: float) -> Answer:
 
 def _bounded_scales() -> Answer:
     """However large a factor the decoder asks for, no Gaussian is larger than the limit."""
-    import torch
-
-    found = []
+    largest = []
     for activation in ("exp", "softplus"):
-        avatar = fresh(replace(TINY, scale_activation=activation))
-        with torch.no_grad():
-            avatar.decoder.linear[-1].bias[3] = 1e30
-        found.append(float(avatar.decode(avatar.every_point, None)[1].detach().max()))
-    return Answer(found, TINY.scale_limit, precision=np.float32)
+        avatar = with_scale(fresh(replace(TINY, scale_activation=activation)), 1e30)
+        largest.append(float(avatar.decode(avatar.every_point, None)[1].detach().max()))
+    return Answer(largest, TINY.scale_limit, precision=np.float32)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -208,18 +208,13 @@ def _contradiction() -> Answer:
 
 def _wrong_pose() -> Answer:
     """One frame in six has the pose of another."""
-    wrong = replace(views()[2], body_pose=views()[5].body_pose)
-    return _ratio(TINY, training_set([*views()[:2], wrong, *views()[3:]]))
-
-
-def _few(count: int) -> Answer:
-    return _ratio(TINY, training_set(views()[:count]))
+    return _ratio(TINY, with_view(2, body_pose=views()[5].body_pose))
 
 
 def _one_pixel() -> Answer:
     """One visible pixel in all."""
     mask = np.full_like(views()[0].mask, MaskState.UNKNOWN)
-    mask[tuple(np.argwhere(views()[0].mask == MaskState.PERSON)[9])] = MaskState.PERSON
+    mask[a_person_pixel(0)] = MaskState.PERSON
     return _ratio(TINY, training_set([replace(views()[0], mask=mask)]))
 
 
@@ -227,7 +222,7 @@ def _speck() -> Answer:
     """A view that shows one pixel of the person and all of the background costs a hundred times what others do; the
     guard must not take it for an explosion."""
     mask = np.full_like(views()[1].mask, MaskState.BACKGROUND)
-    mask[tuple(np.argwhere(views()[1].mask == MaskState.PERSON)[9])] = MaskState.PERSON
+    mask[a_person_pixel(1)] = MaskState.PERSON
     _, story = fitted(TINY, training_set([*views()[:4], replace(views()[1], mask=mask)]))
     return Answer(story, "no step rejected")
 
@@ -246,16 +241,14 @@ def _nothing(hidden: bool) -> Answer:
 def _behind() -> Answer:
     """In one view the body is behind the camera."""
     camera, about = views()[0].camera, np.diag([-1.0, 1, -1])
-    behind = replace(views()[1], camera=Camera(camera.K, about @ camera.R, about @ camera.t, SIZE, SIZE))
-    training = training_set([views()[0], behind, *views()[2:]])
-    return _ratio(TINY, training)
+    return _ratio(TINY, with_view(1, camera=Camera(camera.K, about @ camera.R, about @ camera.t, SIZE, SIZE)))
 
 
 def _bad_pixel(bad: float) -> Answer:
     """One pixel of one view is not finite. Its first step is known; smaller steps cannot help, so none is tried."""
     image = views()[2].image.astype(np.float32)
-    image[tuple(np.argwhere(views()[2].mask == MaskState.PERSON)[9])] = bad
-    training = training_set([*views()[:2], replace(views()[2], image=image), *views()[3:]])
+    image[a_person_pixel(2)] = bad
+    training = with_view(2, image=image)
     stage = Stage1(fresh(TINY), training, 0, Ledger())
     first = next(step for step in range(6) if stage._view_of(step, 6) == 2)
     after, story = fitted(TINY, training)
@@ -267,7 +260,7 @@ def _hidden_bad_pixel() -> Answer:
     """A NaN behind the occluder is nobody's business: 0 × NaN must not enter the loss."""
     image = views()[1].image.astype(np.float32)
     image[views()[1].mask == MaskState.UNKNOWN] = math.nan
-    return _ratio(TINY, training_set([views()[0], replace(views()[1], image=image), *views()[2:]]))
+    return _ratio(TINY, with_view(1, image=image))
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -292,11 +285,10 @@ def _spoiled_once(how: str, at: int) -> Answer:
 
         stage._loss = spoiled
 
-    before = mean_loss(fresh(TINY), training_set())
-    after, story = fitted(TINY, training_set(), prepare=spoil)
-    if f"step {at} rejected, back to 0" not in story:
-        raise AssertionError(f"expected step {at} rejected, got {story!r}")
-    return Answer(math.nan if after is None else mean_loss(after, training_set()) / before, 1.0, note=story)
+    answer = _ratio(TINY, training_set(), prepare=spoil)
+    if f"step {at} rejected, back to 0" not in answer.note:
+        raise AssertionError(f"expected step {at} rejected, got {answer.note!r}")
+    return answer
 
 
 def _spoiled_for_good(at: int) -> Answer:
@@ -322,11 +314,8 @@ def _spoiled_for_good(at: int) -> Answer:
 
 def _bad_start() -> Answer:
     """A feature is NaN before the first step."""
-    import torch
-
     start = fresh(TINY)
-    with torch.no_grad():
-        start.features.table[start.features.index[100]] = math.nan
+    start.features.table.data[start.features.index[100]] = math.nan
     return Answer(fitted(TINY, training_set(), start)[1], "diverged, first bad step 0")
 
 
@@ -388,9 +377,15 @@ def _half_colours() -> Answer:
 
 
 def _training(
-    name: str, what: str, unit: Unit, tolerance: float, why: str, function: Callable[[], Answer], known: str = ""
+    name: str, what: str, function: Callable[[], Answer], unit: Unit, tolerance: float, why: str, known: str = ""
 ) -> Case:
-    return Case(f"inpainthuman-{name}", "training", what, unit, tolerance, why, function, known)
+    return Case(f"inpainthuman-{name}", what, function, unit, tolerance, why, "training", known)
+
+
+_helps = partial(_training, unit="at most", tolerance=0, why=HELPS)
+_step = partial(_training, unit="words", tolerance=0, why=STEP)
+_refused = partial(_training, unit="words", tolerance=0, why=REFUSED)
+_exact = partial(_training, unit="absolute", tolerance=0, why=EXACT)
 
 
 OUT_OF_REACH = (
@@ -400,48 +395,43 @@ OUT_OF_REACH = (
 
 CASES = [
     *(
-        _training(f"rate-{factor:g}", f"step sizes × {factor:g}", "at most", 0, HELPS, partial(_rates, factor))
+        _helps(f"rate-{factor:g}", f"step sizes × {factor:g}",
+               lambda factor=factor: _ratio(scaled_rates(factor), training_set()))
         for factor in (0.1, 1.0, 10.0, 100.0, 1000.0)
     ),
-    _training("rate-1e30", "step sizes × 1e30", "words", 0, "the first step after the first update", _absurd_rates),
-    _training("last-step", "the last step of all gives NaN", "words", 0, STEP, _last_step),
+    _training("rate-1e30", "step sizes × 1e30", _absurd_rates, "words", 0, "the first step after the first update"),
+    _step("last-step", "the last step of all gives NaN", _last_step),
     *(
-        _training(f"loss-{factor:g}", f"loss × {factor:g}, no clipping", "at most", 0, HELPS,
-                  partial(_clipped, factor))
+        _helps(f"loss-{factor:g}", f"loss × {factor:g}, no clipping", partial(_clipped, factor))
         for factor in (1e-6, 1e12)
     ),
-    _training("scale-collapse", "a fit from Gaussians e^-4 as large", "at most", 0, HELPS, partial(_scales, -4.0)),
-    _training("scale-explosion", "a fit from Gaussians at the limit of their scale", "at most", 0, HELPS,
-              partial(_scales, 4.0)),
-    _training("scale-collapse-gradient", "a scale factor of e^-4.9 has a gradient", "absolute", 0, EXACT,
-              partial(_dead_scales, -4.9)),
-    _training("scale-cut-gradient", "a scale factor of e^-6 has a gradient", "absolute", 0, EXACT,
-              partial(_dead_scales, -6.0), OUT_OF_REACH),
-    _training("scale-limit-gradient", "a scale beyond its limit has a gradient", "absolute", 0, EXACT,
-              partial(_dead_scales, 6.0), OUT_OF_REACH),
-    _training("scale-limit", "the largest scale a decoder can ask for", "ulp", 1, "the limit in float32",
-              _bounded_scales),
-    _training("contradiction", "every view with its mask and with the opposite", "at most", 0, HELPS, _contradiction),
-    _training("wrong-pose", "one frame has another's pose", "at most", 0, HELPS, _wrong_pose),
-    _training("one-frame", "one training frame", "at most", 0, HELPS, partial(_few, 1)),
-    _training("two-frames", "two training frames", "at most", 0, HELPS, partial(_few, 2)),
-    _training("one-pixel", "one visible pixel in all", "at most", 0, HELPS, _one_pixel),
-    _training("speck", "a view of one person pixel on known background", "words", 0, STEP, _speck),
-    _training("no-view", "no training view", "words", 0, REFUSED, partial(_nothing, False)),
-    _training("all-hidden", "views without a visible pixel", "words", 0, REFUSED, partial(_nothing, True)),
-    _training("behind-camera", "a view with the body behind the camera", "at most", 0, HELPS, _behind),
-    _training("nan-pixel", "a NaN among the person's pixels", "words", 0, STEP, partial(_bad_pixel, math.nan)),
-    _training("inf-pixel", "an infinite person pixel", "words", 0, STEP, partial(_bad_pixel, math.inf)),
-    _training("nan-hidden", "NaN behind the occluder", "at most", 0, HELPS, _hidden_bad_pixel),
-    _training("nan-loss-once", "the loss of step 9 is NaN", "at most", 0, HELPS, partial(_spoiled_once, "loss", 9)),
-    _training("nan-gradient-once", "a gradient of step 9 is NaN", "at most", 0, HELPS,
-              partial(_spoiled_once, "gradient", 9)),
-    _training("nan-loss-for-good", "every loss from step 9 on is NaN", "words", 0, STEP,
-              partial(_spoiled_for_good, 9)),
-    _training("nan-start", "a feature is NaN before the first step", "words", 0, STEP, _bad_start),
-    _training("resumed-after-rejection", "killed after a rejected step, and gone on with", "absolute", 0, EXACT,
-              _resumed),
-    _training("bfloat16", "matrix products in bfloat16", "at most", 0, HELPS, partial(_half_precision, "bfloat16")),
-    _training("float16-avatar", "pictures from parameters in float16", "absolute", 1 / 255,
-              "a grey level: 11 bits of a feature, through four layers", _half_colours),
+    _helps("scale-collapse", "a fit from Gaussians e^-4 as large", partial(_scales, -4.0)),
+    _helps("scale-explosion", "a fit from Gaussians at the limit of their scale", partial(_scales, 4.0)),
+    _exact("scale-collapse-gradient", "a scale factor of e^-4.9 has a gradient", partial(_dead_scales, -4.9)),
+    _exact("scale-cut-gradient", "a scale factor of e^-6 has a gradient", partial(_dead_scales, -6.0),
+           known=OUT_OF_REACH),
+    _exact("scale-limit-gradient", "a scale beyond its limit has a gradient", partial(_dead_scales, 6.0),
+           known=OUT_OF_REACH),
+    _training("scale-limit", "the largest scale a decoder can ask for", _bounded_scales, "ulp", 1,
+              "the limit in float32"),
+    _helps("contradiction", "every view with its mask and with the opposite", _contradiction),
+    _helps("wrong-pose", "one frame has another's pose", _wrong_pose),
+    _helps("one-frame", "one training frame", lambda: _ratio(TINY, training_set(views()[:1]))),
+    _helps("two-frames", "two training frames", lambda: _ratio(TINY, training_set(views()[:2]))),
+    _helps("one-pixel", "one visible pixel in all", _one_pixel),
+    _step("speck", "a view of one person pixel on known background", _speck),
+    _refused("no-view", "no training view", partial(_nothing, False)),
+    _refused("all-hidden", "views without a visible pixel", partial(_nothing, True)),
+    _helps("behind-camera", "a view with the body behind the camera", _behind),
+    _step("nan-pixel", "a NaN among the person's pixels", partial(_bad_pixel, math.nan)),
+    _step("inf-pixel", "an infinite person pixel", partial(_bad_pixel, math.inf)),
+    _helps("nan-hidden", "NaN behind the occluder", _hidden_bad_pixel),
+    _helps("nan-loss-once", "the loss of step 9 is NaN", partial(_spoiled_once, "loss", 9)),
+    _helps("nan-gradient-once", "a gradient of step 9 is NaN", partial(_spoiled_once, "gradient", 9)),
+    _step("nan-loss-for-good", "every loss from step 9 on is NaN", partial(_spoiled_for_good, 9)),
+    _step("nan-start", "a feature is NaN before the first step", _bad_start),
+    _exact("resumed-after-rejection", "killed after a rejected step, and gone on with", _resumed),
+    _helps("bfloat16", "matrix products in bfloat16", partial(_half_precision, "bfloat16")),
+    _training("float16-avatar", "pictures from parameters in float16", _half_colours, "absolute", 1 / 255,
+              "a grey level: 11 bits of a feature, through four layers"),
 ]  # fmt: skip
