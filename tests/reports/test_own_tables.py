@@ -21,7 +21,7 @@ from ihbench.reports.paper.paper_numbers import paper_table
 from ihbench.reports.paper.paper_table import build_frame
 from tests.reports.fake_runs import SUBJECTS, fake_run, with_about
 from tests.reports.made_up_runs import FLIP, PSNR, made_up, sweep
-from tests.reports.test_ablation import rung, told
+from tests.reports.test_ablation import told, variant
 from tests.reports.test_table_formats import structure
 
 TABLE1, TABLE2 = paper_table("table1"), paper_table("table2")
@@ -89,7 +89,7 @@ def test_the_papers_tables_pass_with_measured_rows(tmp_path, table, seed):
 
 
 def test_the_ablations_table_passes(tmp_path):
-    runs = {name: rung(tmp_path / "runs", 20 + k) for k, name in enumerate(("low", "mid", "high"))}
+    runs = {name: variant(tmp_path / "runs", 20 + k) for k, name in enumerate(("low", "mid", "high"))}
     text, _ = told(runs, (("first", "low", "mid"), ("both", "low", "high")))
     assert linted(text, "md", tmp_path) == []
 
