@@ -14,9 +14,10 @@ from ihbench.metrics import Identity
 from ihbench.metrics.identity import Metric
 from ihbench.metrics.statistics import Interval, holm, mean_interval, paired_test
 from ihbench.record.results import RunResult
+from ihbench.record.scene_means import per_scene, seed_means
 from ihbench.reports.general.clock import clock_notes, one_clock
 from ihbench.reports.general.content import data_words
-from ihbench.reports.general.significance import ALPHA, LEVEL, per_scene
+from ihbench.reports.general.significance import ALPHA, LEVEL
 from ihbench.runner.ablation import AblationSuite, Comparison
 from ihbench.runner.executor import CellOutcome
 
@@ -246,11 +247,7 @@ def _severities(suite: AblationSuite, tables: Sequence[Mapping[str, Any]]) -> li
 
 def _seconds(runs: Sequence[RunResult]) -> dict[str, float]:
     """Scene -> mean fit seconds."""
-    found: dict[str, list[float]] = {}
-    for run in runs:
-        if run.timed:
-            found.setdefault(run.scene, []).append(run.fit_seconds)
-    return {scene: math.fsum(values) / len(values) for scene, values in found.items()}
+    return seed_means((run.scene, run.fit_seconds) for run in runs if run.timed)
 
 
 def _interval(per: Mapping[str, float]) -> Interval | None:

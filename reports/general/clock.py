@@ -9,6 +9,7 @@ from ihbench.clock.machine import BUSY
 from ihbench.document.document import Words
 from ihbench.record.results import RunResult
 from ihbench.record.row_labels import by_label
+from ihbench.record.scene_means import by_scene
 
 UNSTABLE = 0.25  # repeats further apart than this share of their median are called unstable, as in `ihbench kernels`
 
@@ -56,7 +57,9 @@ def one_clock(runs: Sequence[RunResult]) -> bool:
 def unstable(runs: Sequence[RunResult]) -> list[str]:
     """Why the seconds of these runs (one row of a table) are unstable; nothing when they are not known to be."""
     reasons = []
-    apart = max((_spread(group) for group in _by_scene(runs).values()), default=0.0)
+    apart = max(
+        (_spread(group) for group in by_scene((run.scene, run.fit_seconds) for run in runs).values()), default=0.0
+    )
     if apart > UNSTABLE:
         reasons.append(f"repeats {apart:.0%} of their median apart")
     loads = [load for load in map(_load_per_core, runs) if load is not None]
@@ -82,13 +85,6 @@ def clock_notes(rows: Mapping[str, Sequence[RunResult]]) -> list[Words]:
         for reason in unstable(group):
             told.setdefault(reason, []).append(label)
     return [*notes, *(f"unstable seconds: {reason}: {'; '.join(labels)}" for reason, labels in told.items())]
-
-
-def _by_scene(runs: Sequence[RunResult]) -> dict[str, list[float]]:
-    found: dict[str, list[float]] = {}
-    for run in runs:
-        found.setdefault(run.scene, []).append(run.fit_seconds)
-    return found
 
 
 def _spread(seconds: Sequence[float]) -> float:

@@ -3,7 +3,7 @@ error against run time, what was painted, intervals and paired tests."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,10 +22,11 @@ from ihbench.document.document import (
     strong,
 )
 from ihbench.errors import BadInput
-from ihbench.metrics import Identity, Mean, macro_mean
+from ihbench.metrics import Identity, macro_mean
 from ihbench.record.quality_time import Target
-from ihbench.record.results import Rows, RunResult, by_group
+from ihbench.record.results import RunResult, by_group
 from ihbench.record.row_labels import by_label
+from ihbench.record.scene_means import scene_means
 from ihbench.reports.general.clock import one_clock
 from ihbench.reports.general.inpainting import inpainting_section
 from ihbench.reports.general.ledger_table import ledger_section
@@ -68,24 +69,29 @@ def score_tables(results: Sequence[RunResult], presets: Sequence[str] = ()) -> l
         title = f"{protocol} ({digest}), {profile} profile, {data}"
         columns = [i for i in dict.fromkeys(i for r in runs for i in r.rows[r.method]) if _has_a_number(runs, i)]
         if columns:
-            table = _table(runs, [run.rows for run in runs], columns, headline, with_metric=True)
+            table = _table(runs, columns, headline, with_metric=True)
             found.append(replace(table, title=title))
         for preset in presets:
-            having = [run for run in runs if preset in run.presets]
-            rows = [run.presets[preset] for run in having]
-            columns = _preset_columns(rows)
+            rescored = _under(preset, runs)
+            columns = _preset_columns(rescored)
             if columns:
-                table = _table(having, rows, columns, headline, with_metric=True)
+                table = _table(rescored, columns, headline, with_metric=True)
                 found.append(replace(table, title=f"{title}, {preset}"))
     if not found:
         raise BadInput("--fragment: no run that is done has a number here; there is no table to write")
     return found
 
 
-def _preset_columns(rows: Sequence[Rows]) -> list[Identity]:
+def _under(preset: str, runs: Sequence[RunResult]) -> list[RunResult]:
+    """Those that were scored under a further preset, with its numbers in the place of their own."""
+    return [replace(run, rows=run.presets[preset]) for run in runs if preset in run.presets]
+
+
+def _preset_columns(runs: Sequence[RunResult]) -> list[Identity]:
     """Identities with a number in any row."""
-    every = dict.fromkeys(i for found in rows for means in found.values() for i in means)
-    return [i for i in every if any(i in means and not means[i].absent for found in rows for means in found.values())]
+    rows = [means for run in runs for means in run.rows.values()]
+    every = dict.fromkeys(i for means in rows for i in means)
+    return [i for i in every if any(i in means and not means[i].absent for means in rows)]
 
 
 def _group(runs: list[RunResult], presets: Sequence[str], targets: Sequence[Target]) -> list[Block]:
@@ -110,7 +116,7 @@ def _group(runs: list[RunResult], presets: Sequence[str], targets: Sequence[Targ
             shown = columns[0].display
             blocks.append(Heading(3, f"{shown.title} {shown.arrow}{f' ({shown.unit})' if shown.unit else ''}"))
             first = metric == identities[0].metric
-            blocks.append(_table(done, [run.rows for run in done], columns, headline, with_costs=first))
+            blocks.append(_table(done, columns, headline, with_costs=first))
     blocks.append(
         Paragraph(
             f"Mean over test views of a scene, then over scenes ({_scenes(done)}). Headline region: {headline}."
@@ -136,20 +142,19 @@ def data_words(run: RunResult) -> tuple[str | Span, ...]:
 
 def _preset(name: str, runs: list[RunResult], headline: str) -> list[Block]:
     """The table of one further preset, over the runs that were scored under it."""
-    having = [run for run in runs if name in run.presets]
+    rescored = _under(name, runs)
     blocks: list[Block] = [Heading(3, f"preset {name}")]
-    if not having:
+    if not rescored:
         return [*blocks, Paragraph(f"No run was scored under {name}: ihbench report --preset {name}")]
-    rows = [run.presets[name] for run in having]
-    identities = list(dict.fromkeys(i for run, found in zip(having, rows, strict=True) for i in found[run.method]))
-    columns = _preset_columns(rows)
+    identities = list(dict.fromkeys(i for run in rescored for i in run.own))
+    columns = _preset_columns(rescored)
     if columns:
-        blocks.append(_table(having, rows, columns, headline, with_metric=True))
+        blocks.append(_table(rescored, columns, headline, with_metric=True))
     absent = {
-        f"absent: {i.display.title} of {name}: {found[run.method][i].reason}"
-        for run, found in zip(having, rows, strict=True)
-        for i in identities
-        if i in found[run.method] and found[run.method][i].absent
+        f"absent: {i.display.title} of {name}: {mean.reason}"
+        for run in rescored
+        for i, mean in run.own.items()
+        if mean.absent
     }
     return [*blocks, *_definitions(identities), Bullets(("scored from the runs' 8-bit renders", *sorted(absent)))]
 
@@ -169,64 +174,50 @@ def _definitions(identities: Sequence[Identity]) -> list[Block]:
 
 
 def _table(
-    runs: list[RunResult],
-    rows_of: Sequence[Rows],  # of each run
+    runs: Sequence[RunResult],
     columns: Sequence[Identity],
     headline: str,
     *,
     with_costs: bool = False,
     with_metric: bool = False,
 ) -> Table:
-    parsed = [i for i in columns]
-    names = [i.region for i in parsed]
-    if with_metric:
-        names = [f"{i.display.title}{i.display.arrow} {i.region}" for i in parsed]
+    names = [f"{i.display.title}{i.display.arrow} {i.region}" if with_metric else i.region for i in columns]
     names = [  # regions of several presets in one table
-        f"{name} ({i.variant})" if names.count(name) > 1 else name for i, name in zip(parsed, names, strict=True)
+        f"{name} ({i.variant})" if names.count(name) > 1 else name for i, name in zip(columns, names, strict=True)
     ]
-    titles: list[Words] = [strong(t) if i.region == headline else t for i, t in zip(parsed, names, strict=True)]
+    titles: list[Words] = [strong(t) if i.region == headline else t for i, t in zip(columns, names, strict=True)]
     costs = ["fit s", "total s", "peak MB"] if with_costs else []
     head: list[Words] = ["method", "scenes", "seeds", *titles, *costs]
     lines: list[tuple[Words, ...]] = []
-    where = {id(run): k for k, run in enumerate(runs)}
     for label, group in by_label(runs).items():
-        chosen = [where[id(run)] for run in group]
         cells = [
             label,
             str(len({r.scene for r in group})),
             ", ".join(sorted({str(r.seed) for r in group})),
         ]
-        cells += [_cell([(runs[k].scene, rows_of[k][runs[k].method]) for k in chosen], i) for i in columns]
+        cells += [_cell(group, i) for i in columns]
         if with_costs:
             alike = one_clock(group)  # seconds of several machines have no mean
             cells += [_mean_of(group, name) if alike else "—" for name in ("fit_seconds", "total_seconds")]
             cells.append(_largest(group, "peak_mb"))
         lines.append(tuple(cells))
         method = group[0].method
-        further = [row for k in chosen for row in rows_of[k] if row.startswith(f"{method} [")]
+        further = [row for run in group for row in run.rows if row.startswith(f"{method} [")]
         for row in dict.fromkeys(further):  # groups of test views that the protocol scores apart
-            having = [(runs[k].scene, rows_of[k][row]) for k in chosen if row in rows_of[k]]
             name = label + row.removeprefix(method)
-            lines.append((name, cells[1], cells[2], *(_cell(having, i) for i in columns), *([""] * len(costs))))
+            lines.append((name, cells[1], cells[2], *(_cell(group, i, row) for i in columns), *([""] * len(costs))))
     for row in ROWS:
-        having = list(
-            {r.scene: (r.scene, rows[row]) for r, rows in zip(runs, rows_of, strict=True) if row in rows}.values()
-        )
-        if having:
-            numbers = [_cell(having, i) for i in columns]
-            lines.append((emphasis(row), str(len(having)), "", *numbers, *([""] * len(costs))))
+        alike = {run.scene: run for run in runs if row in run.rows}  # one is as good as another
+        if alike:
+            numbers = [_cell(alike.values(), i, row) for i in columns]
+            lines.append((emphasis(row), str(len(alike)), "", *numbers, *([""] * len(costs))))
     return Table(tuple(head), tuple(lines), left=3)
 
 
-def _cell(per_run: list[tuple[str, Mapping[Identity, Mean]]], identity: Identity) -> str:
-    """Mean over seeds within a scene, then over scenes."""
-    by_scene: dict[str, dict[str, Mean]] = {}
-    for k, (scene, means) in enumerate(per_run):
-        if identity in means:
-            by_scene.setdefault(scene, {})[str(k)] = means[identity]
-    if not by_scene:
-        return "—"
-    return identity.display.text(macro_mean({scene: macro_mean(runs) for scene, runs in by_scene.items()}).value)
+def _cell(runs: Iterable[RunResult], identity: Identity, row: str | None = None) -> str:
+    """Mean over seeds within a scene, then over scenes; `row` as for `scene_means`."""
+    means = scene_means(runs, identity, row)
+    return identity.display.text(macro_mean(means).value) if means else "—"
 
 
 def _mean_of(runs: list[RunResult], key: str) -> str:

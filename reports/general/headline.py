@@ -11,8 +11,8 @@ from ihbench.errors import visible
 from ihbench.metrics import Identity, macro_mean
 from ihbench.record.results import TRACEBACK, RunResult, by_group
 from ihbench.record.row_labels import by_label
+from ihbench.record.scene_means import scene_means
 from ihbench.reports.general.clock import one_clock
-from ihbench.reports.general.significance import scene_means
 from ihbench.scoring.calibration import ROWS
 
 WIDTH = 80

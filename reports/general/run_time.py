@@ -27,9 +27,10 @@ from ihbench.record.quality_time import (
     time_to_quality,
 )
 from ihbench.record.results import RunResult
+from ihbench.record.scene_means import by_scene, per_scene, seed_means
 from ihbench.reports.general.clock import clock_notes
 from ihbench.reports.general.configurations import Configuration, configurations
-from ihbench.reports.general.significance import LEVEL, per_scene
+from ihbench.reports.general.significance import LEVEL
 
 ON_THE_CURVE = ("psnr", "flip")  # targets are chosen for these where none is stated
 SPREAD = f"{LEVEL:.0%}"
@@ -85,12 +86,9 @@ def work_points(configs: Sequence[Configuration], identity: Identity, scenes: Se
 
 def seconds_interval(runs: Sequence[RunResult], key: str = "fit_seconds") -> Interval:
     """Mean seconds with its interval: over scenes (each the mean of its repeats), or over repeats of one scene."""
-    by_scene: dict[str, list[float]] = {}
-    for run in runs:
-        by_scene.setdefault(run.scene, []).append(float(getattr(run.about, key)))
-    if len(by_scene) > 1:
-        return mean_interval(by_scene, LEVEL)
-    return mean_interval({str(k): seconds for k, seconds in enumerate(next(iter(by_scene.values())))}, LEVEL)
+    seconds = by_scene((run.scene, float(getattr(run.about, key))) for run in runs)
+    repeats = {str(k): value for k, value in enumerate(next(iter(seconds.values())))}
+    return mean_interval(seconds if len(seconds) > 1 else repeats, LEVEL)
 
 
 def curves(configuration: Configuration, identity: Identity) -> dict[tuple[str, int], QualityCurve]:
@@ -110,11 +108,10 @@ def curve_identities(configs: Sequence[Configuration]) -> list[Identity]:
 
 def times_to(target: float, found: Mapping[tuple[str, int], QualityCurve], scenes: Sequence[str]) -> dict[str, float]:
     """Scene -> seconds to the quality, the median over its seeds: `NEVER` where half or more never get there."""
-    by_scene: dict[str, list[float]] = {}
-    for (scene, _), curve in found.items():
-        if scene in scenes:
-            by_scene.setdefault(scene, []).append(time_to_quality(curve, target))
-    return {scene: median(times) for scene, times in by_scene.items()}
+    times = by_scene(
+        (scene, time_to_quality(curve, target)) for (scene, _), curve in found.items() if scene in scenes
+    )
+    return {scene: median(seconds) for scene, seconds in times.items()}
 
 
 def standing(runs: Iterable[RunResult]) -> str:
@@ -132,12 +129,8 @@ def standing(runs: Iterable[RunResult]) -> str:
 
 def in_table(configuration: Configuration, identity: Identity, scenes: Sequence[str]) -> dict[str, float]:
     """Scene -> what the table has of these runs, over all test views: the mean over seeds, NaN where absent."""
-    by_scene: dict[str, list[float]] = {}
-    for run in configuration.runs:
-        mean = run.own.get(identity)
-        if run.scene in scenes:
-            by_scene.setdefault(run.scene, []).append(math.nan if mean is None else mean.value)
-    return {scene: sum(values) / len(values) for scene, values in by_scene.items()}
+    means = ((run.scene, run.own.get(identity)) for run in configuration.runs if run.scene in scenes)
+    return seed_means((scene, math.nan if mean is None else mean.value) for scene, mean in means)
 
 
 # ---------------------------------------------------------------------------------------------------------- sections
@@ -359,11 +352,9 @@ def _end_table(configs: Sequence[Configuration], known: Sequence[Identity], head
 def _end_cell(configuration: Configuration, identity: Identity, scenes: Sequence[str]) -> str:
     """ "20.21, in the table 17.80 (+2.41)"; "" where both are printed alike, or one is absent."""
     metric = identity.display
-    ends: dict[str, list[float]] = {}
-    for (scene, _), curve in curves(configuration, identity).items():
-        if scene in scenes:
-            ends.setdefault(scene, []).append(float(curve.values[-1]))
-    end = sum(sum(values) / len(values) for values in ends.values()) / len(ends) if ends else math.nan
+    last = ((scene, float(c.values[-1])) for (scene, _), c in curves(configuration, identity).items())
+    ends = seed_means((scene, value) for scene, value in last if scene in scenes)
+    end = sum(ends.values()) / len(ends) if ends else math.nan
     table = list(in_table(configuration, identity, list(ends)).values())
     whole = sum(table) / len(table) if table else math.nan
     if not (math.isfinite(end) and math.isfinite(whole)) or metric.text(end) == metric.text(whole):
@@ -403,12 +394,9 @@ def _area_table(configs: Sequence[Configuration], known: Sequence[Identity]) -> 
 def _area_cell(
     found: Mapping[tuple[str, int], QualityCurve], identity: Identity, start: float, end: float, scenes: Sequence[str]
 ) -> str:
-    by_scene: dict[str, list[float]] = {}
-    for (scene, _), curve in found.items():
-        area = area_under_curve(curve, start, end)
-        if scene in scenes and math.isfinite(area):
-            by_scene.setdefault(scene, []).append(area)
-    return identity.display.text(mean_interval(by_scene, LEVEL).value) if by_scene else "—"
+    areas = ((scene, area_under_curve(curve, start, end)) for (scene, _), curve in found.items() if scene in scenes)
+    known = by_scene((scene, area) for scene, area in areas if math.isfinite(area))
+    return identity.display.text(mean_interval(known, LEVEL).value) if known else "—"
 
 
 def _seconds(value: float, unit: str = " s") -> str:

@@ -9,10 +9,11 @@ import math
 from collections.abc import Mapping, Sequence
 
 from ihbench.document.document import Block, Heading, Paragraph, Table, Words, bullets
-from ihbench.metrics import Identity, Mean, macro_mean
+from ihbench.metrics import Identity
 from ihbench.metrics.identity import Metric
 from ihbench.metrics.statistics import holm, mean_interval, paired_test, smallest_detectable_difference
 from ihbench.record.results import RunResult
+from ihbench.record.scene_means import per_scene
 
 LEVEL = 0.95
 ALPHA = 0.05
@@ -54,23 +55,6 @@ def intervals_section(
         Paragraph(f"Intervals: {'; '.join(sorted(methods))}."),
         *bullets([line for i in columns for line in _comparisons(values[i], i.display)]),
     ]
-
-
-def per_scene(runs: Sequence[RunResult], identity: Identity, row: str | None = None) -> dict[str, float]:
-    """Scene -> mean over its runs (seeds); scenes without a finite number are left out."""
-    found = scene_means(runs, identity, row)
-    return {scene: mean.value for scene, mean in found.items() if math.isfinite(mean.value)}
-
-
-def scene_means(runs: Sequence[RunResult], identity: Identity, row: str | None = None) -> dict[str, Mean]:
-    """Scene -> mean over its runs (seeds), absent and infinite ones included. `row` names another row of the runs'
-    scores than the method's own, such as a calibration row or a group of test views."""
-    by_scene: dict[str, dict[str, Mean]] = {}
-    for k, run in enumerate(runs):
-        mean = run.rows.get(row or run.method, {}).get(identity)
-        if mean is not None:
-            by_scene.setdefault(run.scene, {})[str(k)] = mean
-    return {scene: macro_mean(found) for scene, found in by_scene.items()}
 
 
 def _comparisons(values: Mapping[str, Mapping[str, float]], metric: Metric) -> list[str]:

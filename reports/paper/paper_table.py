@@ -30,7 +30,8 @@ from ihbench.metrics.statistics import Interval, mean_interval
 from ihbench.record.results import RunResult, group_row
 from ihbench.record.row_choice import EVERYTHING, Choice
 from ihbench.record.row_labels import by_label
-from ihbench.reports.general.significance import LEVEL, scene_means
+from ihbench.record.scene_means import scene_means
+from ihbench.reports.general.significance import LEVEL
 from ihbench.reports.paper.paper_numbers import Column, Component, Group, PaperTable
 from ihbench.scene.protocol import REGIONS
 from ihbench.scoring.calibration import DESCRIPTIONS, ROWS
