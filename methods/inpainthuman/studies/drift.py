@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,12 +61,7 @@ class Flicker:
     reason: str
 
 
-def identity_drift(
-    views: Sequence[CropView],
-    completed: Sequence[Image],
-    body: Body,
-    texels: int = TEXELS,
-) -> Drift:
+def identity_drift(views: Sequence[CropView], completed: Sequence[Image], body: Body, texels: int = TEXELS) -> Drift:
     """Compare what is painted on the body with what the views show of the same surface.
 
     Only pixels none of whose neighbours is background count: at the rim colours are mixed. Raises `ValueError` unless
@@ -75,37 +69,23 @@ def identity_drift(
     """
     table = texel_table(body, texels)
     seen, painted = _sightings(views, completed, body, texels)
-    (rgb, delta_e), n = _against_seen(painted, seen, len(table.index), (_rgb_distance, _delta_e))
-    rgb_floor, delta_e_floor = _among_seen(seen, len(table.index), (_rgb_distance, _delta_e))
+    (rgb, delta_e), n = _from_seen(painted, seen, len(table.index), (_rgb_distance, _delta_e))
+    (rgb_floor, delta_e_floor), _ = _from_seen(seen, seen, len(table.index), (_rgb_distance, _delta_e))
     patches_seen = [patch_texture(*sighting, table) for sighting in seen]
     patches_painted = [patch_texture(*sighting, table) for sighting in painted]
-    (texture,), n_patches = _against_seen(patches_painted, patches_seen, patch_count(texels), (_euclidean,))
-    (texture_floor,) = _among_seen(patches_seen, patch_count(texels), (_euclidean,))
+    (texture,), n_patches = _from_seen(patches_painted, patches_seen, patch_count(texels), (_euclidean,))
+    (texture_floor,), _ = _from_seen(patches_seen, patches_seen, patch_count(texels), (_euclidean,))
     reasons = [
         ("no texel is painted in one view and seen in another", n == 0),
         ("no patch is painted in one view and seen in another", n_patches == 0),
         ("no texel is seen in two views", math.isnan(rgb_floor)),
         ("no patch is seen in two views", math.isnan(texture_floor)),
     ]
-    return Drift(
-        texels=n,
-        rgb=rgb,
-        delta_e=delta_e,
-        rgb_floor=rgb_floor,
-        delta_e_floor=delta_e_floor,
-        patches=n_patches,
-        texture=texture,
-        texture_floor=texture_floor,
-        reason="; ".join(reason for reason, absent in reasons if absent),
-    )
+    reason = "; ".join(reason for reason, absent in reasons if absent)
+    return Drift(n, rgb, delta_e, rgb_floor, delta_e_floor, n_patches, texture, texture_floor, reason)
 
 
-def flicker(
-    views: Sequence[CropView],
-    completed: Sequence[Image],
-    body: Body,
-    texels: int = TEXELS,
-) -> Flicker:
+def flicker(views: Sequence[CropView], completed: Sequence[Image], body: Body, texels: int = TEXELS) -> Flicker:
     """Follow the painted texels from view to view, in order of index. Pixels count as in `identity_drift`."""
     n_texels = len(texel_table(body, texels).index)
     seen, painted = _sightings(views, completed, body, texels)
@@ -124,36 +104,24 @@ def flicker(
     return Flicker(n, deviation, change, n_seen, deviation_floor, change_floor, reason)
 
 
-class HiddenScores(TypedDict):
-    """Of one region: means over all of its pixels, over the views that hide something, and view by view."""
-
-    pixels: int
-    pooled: dict[str, float]  # psnr, ssim, flip
-    mean: dict[str, float]
-    views: list[dict[str, float]]  # view, pixels, psnr, ssim, flip
-    reason: str  # why numbers are absent
-
-
 def hidden_scores(
     completed: Sequence[Image],
     truths: Sequence[Image],  # the un-occluded crops
     views: Sequence[CropView],
     truth_silhouettes: Sequence[NDArray[np.bool_]],  # [S, W] complete
     background: tuple[float, float, float] = (1.0, 1.0, 1.0),  # RGB in [0, 1], of the metrics' painting
-) -> dict[str, HiddenScores]:
-    """Scores of the hidden person: unknown pixels inside the true silhouette, and of those on the posed body model
-    alone (`on_body`), where a painter that takes the model for the silhouette is judged by its colours.
+) -> dict[str, dict[str, float]]:
+    """Scores of the hidden person: unknown pixels inside the true silhouette (`hidden`), and of those on the posed
+    body model alone (`on_body`), where an inpainter that takes the model for the silhouette is judged by its colours.
 
-    Per region `psnr`, `ssim` and `flip` (without learned weights) pooled over all pixels of all views, their means
-    over the views that hide something (PSNRs of inf left out unless all are), and one row per view. Absent numbers
-    are NaN with a `reason`. Raises `ValueError` for images that cannot be compared.
+    Per region `psnr`, `ssim` and `flip` (without learned weights) pooled over all pixels of all views; NaN where
+    there is none. Raises `ValueError` for images that cannot be compared.
     """
     hidden = [view.unknown & inside for view, inside in zip(views, truth_silhouettes, strict=True)]
     on_body = [mask & view.body for mask, view in zip(hidden, views, strict=True)]
-    numbers = [view.index for view in views]
     return {
-        "hidden": _scores(completed, truths, hidden, numbers, background),
-        "on_body": _scores(completed, truths, on_body, numbers, background),
+        "hidden": _pooled(completed, truths, hidden, background),
+        "on_body": _pooled(completed, truths, on_body, background),
     }
 
 
@@ -186,41 +154,27 @@ def _euclidean(a: NDArray, b: NDArray) -> NDArray:
     return np.linalg.norm(a - b, axis=1)
 
 
-def _sum_and_count(sightings: Sequence[Sighting], size: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """[size, C] and [size]."""
-    channels = sightings[0][1].shape[1] if sightings else 3
+def _from_seen(
+    shown: Sequence[Sighting], seen: Sequence[Sighting], size: int, distances: Sequence[Distance]
+) -> tuple[list[float], int]:
+    """Mean distances of what is shown to the mean of all sightings, of all others where `shown` are the sightings
+    themselves; NaN for none. And how many numbers have both."""
+    channels = seen[0][1].shape[1] if seen else 3
     total, count = np.zeros((size, channels)), np.zeros(size, np.int64)
-    for number, values in sightings:
+    for number, values in seen:
         total[number] += values
         count[number] += 1
-    return total, count
-
-
-def _against_seen(
-    painted: Sequence[Sighting], seen: Sequence[Sighting], size: int, distances: Sequence[Distance]
-) -> tuple[list[float], int]:
-    """Mean distances of paintings to the mean of all sightings, NaN for none; and how many numbers have both."""
-    total, count = _sum_and_count(seen, size)
-    used, found = np.zeros(size, bool), [[np.zeros(0)] for _ in distances]
-    for number, values in painted:
-        known = count[number] > 0
+    used, results = np.zeros(size, bool), [[np.zeros(0)] for _ in distances]
+    for number, values in shown:
+        known = count[number] > (shown is seen)
         number, values = number[known], values[known]
         used[number] = True
-        for out, distance in zip(found, distances, strict=True):
-            out.append(distance(values, total[number] / count[number, None]))
-    return [_mean(np.concatenate(values)) for values in found], int(used.sum())
-
-
-def _among_seen(seen: Sequence[Sighting], size: int, distances: Sequence[Distance]) -> list[float]:
-    """Mean distances of sightings to the mean of the others, NaN for none."""
-    total, count = _sum_and_count(seen, size)
-    found = [[np.zeros(0)] for _ in distances]
-    for number, values in seen:
-        known = count[number] > 1
-        number, values = number[known], values[known]
-        for out, distance in zip(found, distances, strict=True):
-            out.append(distance(values, (total[number] - values) / (count[number, None] - 1)))
-    return [_mean(np.concatenate(values)) for values in found]
+        others, n = total[number], count[number, None]
+        if shown is seen:
+            others, n = others - values, n - 1
+        for out, distance in zip(results, distances, strict=True):
+            out.append(distance(values, others / n))
+    return [_mean(np.concatenate(values)) for values in results], int(used.sum())
 
 
 def _deviation(sightings: Sequence[Sighting], size: int) -> tuple[int, float]:
@@ -251,44 +205,26 @@ def _mean(values: NDArray) -> float:
 # ------------------------------------------------------------------------------------------------ scores
 
 
-def _scores(
+def _pooled(
     completed: Sequence[Image],
     truths: Sequence[Image],
     masks: Sequence[NDArray[np.bool_]],
-    numbers: Sequence[int],
     background: tuple[float, float, float],
-) -> HiddenScores:
-    rows, error, pixels = [], 0.0, 0
-    for painted, truth, mask, number in zip(completed, truths, masks, numbers, strict=True):
+) -> dict[str, float]:
+    """PSNR, SSIM and FLIP over all pixels of the masks; NaN without any."""
+    counts, errors, ssims, flips = [], [], [], []
+    for painted, truth, mask in zip(completed, truths, masks, strict=True):
         n = int(mask.sum())
-        scores = {
-            "psnr": psnr(painted, truth, mask),
-            "ssim": ssim(painted, truth, mask, background=background),
-            "flip": flip(painted, truth, mask, background=background),
-        }
-        rows.append({"view": number, "pixels": n, **scores})
         if n:
-            error += n * 10 ** (-scores["psnr"] / 10)
-            pixels += n
-    hiding = [row for row in rows if row["pixels"]]
-    pooled = {
-        name: math.fsum(row["pixels"] * row[name] for row in hiding) / pixels if pixels else math.nan
-        for name in ("ssim", "flip")
-    }
-    pooled_psnr = decibels(error / pixels) if pixels else math.nan
-    mean = {name: _mean_finite([row[name] for row in hiding]) for name in ("psnr", "ssim", "flip")}
+            counts.append(n)
+            errors.append(n * 10 ** (-psnr(painted, truth, mask) / 10))
+            ssims.append(n * ssim(painted, truth, mask, background=background))
+            flips.append(n * flip(painted, truth, mask, background=background))
+    pixels = sum(counts)
+    if not pixels:
+        return dict.fromkeys(("psnr", "ssim", "flip"), math.nan)
     return {
-        "pixels": pixels,
-        "pooled": {"psnr": pooled_psnr, **pooled},
-        "mean": mean,
-        "views": rows,
-        "reason": "" if pixels else "no hidden pixel shows the person",
+        "psnr": decibels(sum(errors) / pixels),
+        "ssim": math.fsum(ssims) / pixels,
+        "flip": math.fsum(flips) / pixels,
     }
-
-
-def _mean_finite(values: Sequence[float]) -> float:
-    """The mean of the finite values; inf if there are only infinite ones, NaN for none."""
-    finite = [value for value in values if math.isfinite(value)]
-    if finite:
-        return math.fsum(finite) / len(finite)
-    return math.inf if any(math.isinf(value) for value in values) else math.nan

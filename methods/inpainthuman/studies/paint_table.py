@@ -23,7 +23,6 @@ from ihbench.scene.protocol import Protocol
 from ihbench.scene.views import open_scene, uncovered
 
 SIZES = {"mini": (128, False), "sd2": (512, True)}  # px, height of all painters' crops, and whether they are square
-SCORES = ("psnr", "ssim", "flip")
 
 
 def paint_scene(
@@ -69,8 +68,8 @@ def paint_scene(
             scores = hidden_scores(painted, truth_images, asked, silhouettes, protocol.image.background)
             drift, flick = identity_drift(asked, painted, body), flicker(asked, painted, body)
             scored.append(
-                {name: scores["hidden"]["pooled"][name] for name in SCORES}
-                | {f"{name}_on_body": scores["on_body"]["pooled"][name] for name in SCORES}
+                scores["hidden"]
+                | {f"{name}_on_body": value for name, value in scores["on_body"].items()}
                 | {"delta_e": drift.delta_e, "flicker": flick.deviation, "seconds": ledger.seconds}
             )
             pictures.setdefault(row, _row(painted))
