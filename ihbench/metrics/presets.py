@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,18 +46,14 @@ def _psnr(frame: Frame, mask: Mask | None) -> float:
 
 
 def _ssim(frame: Frame, mask: Mask | None) -> float:
-    def over(region: Mask | None) -> float:
-        return mean_ssim(frame.pred, frame.truth, frame.differs, region, background=frame.background)
-
+    over = partial(mean_ssim, frame.pred, frame.truth, frame.differs, background=frame.background)
     return 1 - _mean_over(frame, mask, "ssim", HEADLINE.size // 2, lambda region: 1 - over(region))
 
 
 def _flip(frame: Frame, mask: Mask | None) -> float:
     from ihbench.metrics.flip import PPD, Filters, mean_flip
 
-    def over(region: Mask | None) -> float:
-        return mean_flip(frame.pred, frame.truth, frame.differs, region, frame.background)
-
+    over = partial(mean_flip, frame.pred, frame.truth, frame.differs, background=frame.background)
     return _mean_over(frame, mask, "flip", Filters.of(PPD).radius, over)
 
 
@@ -82,12 +79,12 @@ def _lpips(frame: Frame, mask: Mask | None) -> float | str:
     return _network("vgg", "[-1,1]", frame.pred, frame.truth, mask, frame.background, box)
 
 
-def _painted(metric: str, variant: str, value_range: str) -> Callable[[str, Color], Identity]:
-    """The identity of a metric that paints what lies outside a region."""
+def _named(metric: str, variant: str, value_range: str, painted: bool = False) -> Callable[[str, Color], Identity]:
+    """The identity of a metric; `painted` where it paints what lies outside a region."""
 
     def identity(region: str, background: Color) -> Identity:
-        painted = "" if region == "full" else background_part(background)
-        return Identity(metric, variant, value_range, region, version=1, background=painted)
+        paint = background_part(background) if painted and region != "full" else ""
+        return Identity(metric, variant, value_range, region, version=1, background=paint)
 
     return identity
 
@@ -103,41 +100,24 @@ def _without(net: str) -> Callable[[], str]:
     return lacking
 
 
-def _unpainted(metric: str, variant: str, value_range: str) -> Callable[[str, Color], Identity]:
-    return lambda region, background: Identity(metric, variant, value_range, region, version=1)
-
-
 IHBENCH = Preset(
     name="ihbench",
     about="8-bit images; pooled PSNR, Gaussian SSIM, LPIPS (VGG) and FLIP; regions painted first, nothing leaks in",
     source="this bench",
     prepare=_prepare_rounded,
     measures=(
-        Measure(
-            _unpainted("psnr", "pooled", "range1"),
-            _psnr,
-            "-10 log10 of the mean squared error over the region's pixels and channels",
-        ),
-        Measure(
-            _painted("ssim", "gauss11-1.5", "range1"),
-            _ssim,
-            "mean over the region of the SSIM map: Gaussian 11×11, sigma 1.5, population moments, mirrored edges",
-        ),
-        Measure(
-            _painted("lpips", "vgg-0.1", "[-1,1]"),
-            _lpips,
-            "LPIPS v0.1, VGG, fed [-1,1]; regions cropped to the body's box",
-            slow=True,
-            lacking=_without("vgg"),
-        ),
-        Measure(
-            _painted("flip", "ldr-67ppd", "srgb"),
-            _flip,
-            "mean over the region of the LDR-FLIP map at 67 pixels per degree; needs no weights",
-        ),
+        Measure(_named("psnr", "pooled", "range1"), _psnr,
+                "-10 log10 of the mean squared error over the region's pixels and channels"),
+        Measure(_named("ssim", "gauss11-1.5", "range1", painted=True), _ssim,
+                "mean over the region of the SSIM map: Gaussian 11×11, sigma 1.5, population moments, mirrored "
+                "edges"),
+        Measure(_named("lpips", "vgg-0.1", "[-1,1]", painted=True), _lpips,
+                "LPIPS v0.1, VGG, fed [-1,1]; regions cropped to the body's box", slow=True, lacking=_without("vgg")),
+        Measure(_named("flip", "ldr-67ppd", "srgb", painted=True), _flip,
+                "mean over the region of the LDR-FLIP map at 67 pixels per degree; needs no weights"),
     ),
     needs=("box",),
-)
+)  # fmt: skip
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -195,26 +175,14 @@ def _network(
         return str(error)
 
 
-def _whole_lpips(net: str, feed: str) -> Compute:
-    return lambda frame, mask: _network(net, feed, frame.pred, frame.truth)
-
-
-def _map_ssim(window: Window, crop_scalar: Window) -> Compute:
+def _occnerf_ssim(frame: Frame, mask: Mask | None) -> float:
     """Mean over the mask of the unpainted map; the whole frame's scalar leaves out the library's border."""
-
-    def compute(frame: Frame, mask: Mask | None) -> float:
-        chosen = crop_scalar if mask is None else window
-        return mean_ssim(frame.pred, frame.truth, frame.differs, mask, chosen, background=None)
-
-    return compute
+    window = SKIMAGE if mask is None else SKIMAGE_MAP
+    return mean_ssim(frame.pred, frame.truth, frame.differs, mask, window, background=None)
 
 
 def _whole_ssim(window: Window) -> Compute:
     return lambda frame, mask: mean_ssim(frame.pred, frame.truth, frame.differs, None, window)
-
-
-def _channels_psnr(frame: Frame, mask: Mask | None) -> float:
-    return frame.squared_error.mean_of_channels(mask)
 
 
 def _box_ssim(frame: Frame, mask: Mask | None) -> float:
@@ -238,51 +206,49 @@ def _gtu_lpips(frame: Frame, mask: Mask | None) -> float | str:
     return _network("alex", "[-1,1]", frame.pred, frame.truth, mask, (0.5, 0.5, 0.5), whole)
 
 
+PSNR_FORMS: dict[str, tuple[Compute, str]] = {
+    "pooled": (_psnr, "mean squared error pooled over pixels and channels"),
+    "channels": (lambda frame, mask: frame.squared_error.mean_of_channels(mask), "mean of channel PSNRs"),
+}
+SSIM_FORMS = {  # name -> value range, definition
+    "uniform7": ("range2", "scikit-image's uniform 7×7, sample moments, 3 px of the edges cut off, data range 2"),
+    "uniform7-map": (
+        "range2", "region mean of scikit-image's uniform 7×7 map, sample moments, data range 2, nothing painted"
+    ),
+    "gauss11-zero": ("range1", "Gaussian 11×11, sigma 1.5, zeros beyond the edges"),
+    "gauss11-crop5": ("range1", "Gaussian 11×11, sigma 1.5, 5 px of the edges cut off"),
+    "gauss11": ("range1", "Gaussian 11×11, sigma 1.5, edges reflected, none cut off"),
+}  # fmt: skip
+
+
 def _measures(
     evaluator: str,
-    psnr_of: Compute,
     psnr_form: str,
-    ssim_of: Compute,
-    ssim_form: str,
-    ssim_range: str,
-    lpips_of: Compute | None,
-    lpips_form: str,
-    lpips_feed: str,
-    regions: tuple[str, ...],
+    ssim: dict[str, Compute],  # by form
+    lpips: tuple[str, str] | None = None,  # net, feed
+    regions: tuple[str, ...] = ("full",),
+    lpips_of: Compute | None = None,  # None: over the whole frame
 ) -> tuple[Measure, ...]:
     """PSNR, SSIM and LPIPS of a released evaluator under its own name."""
-    found = [
-        Measure(
-            _unpainted("psnr", f"{evaluator}-{psnr_form}", "range1"),
-            psnr_of,
-            {"pooled": "mean squared error pooled over pixels and channels", "channels": "mean of channel PSNRs"}[
-                psnr_form
-            ],
-            regions,
-        ),
-        Measure(_unpainted("ssim", f"{evaluator}-{ssim_form}", ssim_range), ssim_of, SSIM_FORMS[ssim_form], regions),
-    ]
-    if lpips_of is not None:
-        about = f"LPIPS v0.1, {lpips_form}, fed {lpips_feed}"
-        identity = _unpainted("lpips", f"{evaluator}-{lpips_form}", lpips_feed)
-        found.append(Measure(identity, lpips_of, about, regions, slow=True, lacking=_without(lpips_form)))
-    return tuple(found)
+    measures = [Measure(_named("psnr", f"{evaluator}-{psnr_form}", "range1"), *PSNR_FORMS[psnr_form], regions)]
+    if lpips is not None:
+        net, feed = lpips
+        compute = lpips_of or (lambda frame, mask: _network(net, feed, frame.pred, frame.truth))
+        identity, about = _named("lpips", f"{evaluator}-{net}", feed), f"LPIPS v0.1, {net}, fed {feed}"
+        measures.append(Measure(identity, compute, about, regions, slow=True, lacking=_without(net)))
+    for k, (form, compute) in enumerate(ssim.items()):
+        value_range, about = SSIM_FORMS[form]
+        measure = Measure(_named("ssim", f"{evaluator}-{form}", value_range), compute, about, regions)
+        measures.insert(2 * k + 1, measure)  # PSNR, SSIM, LPIPS; a second SSIM comes last
+    return tuple(measures)
 
-
-SSIM_FORMS = {
-    "uniform7": "scikit-image's uniform 7×7, sample moments, 3 px of the edges cut off, data range 2",
-    "uniform7-map": "region mean of scikit-image's uniform 7×7 map, sample moments, data range 2, nothing painted",
-    "gauss11-zero": "Gaussian 11×11, sigma 1.5, zeros beyond the edges",
-    "gauss11-crop5": "Gaussian 11×11, sigma 1.5, 5 px of the edges cut off",
-    "gauss11": "Gaussian 11×11, sigma 1.5, edges reflected, none cut off",
-}
 
 NEURALBODY = Preset(
     name="neuralbody",
     about="the projected 3-D box: PSNR over its pixels, SSIM on its bounding rectangle",
     source="zju3dv/neuralbody 3c516b9 lib/evaluators/if_nerf.py:15-68; scikit-image 0.14 compare_ssim",
     prepare=_floats,
-    measures=_measures("neuralbody", _psnr, "pooled", _box_ssim, "uniform7", "range2", None, "", "", ("box+0.05",)),
+    measures=_measures("neuralbody", "pooled", {"uniform7": _box_ssim}, regions=("box+0.05",)),
     needs=("box+0.05",),
 )
 
@@ -291,12 +257,9 @@ HUMANNERF = Preset(
     about="the whole frame in 8 bits, both images painted outside the projected box",
     source="chungyiweng/humannerf c753322 run.py:36-49, core/utils/image_util.py:18; metrics as told in its issue 8",
     prepare=_boxed("box+0.3", truncated, truncated, both=True),
-    measures=_measures(
-        "humannerf", _psnr, "pooled", _whole_ssim(SKIMAGE), "uniform7", "range2", _whole_lpips("vgg", "[-1,1]"),
-        "vgg", "[-1,1]", ("full",),
-    ),
+    measures=_measures("humannerf", "pooled", {"uniform7": _whole_ssim(SKIMAGE)}, ("vgg", "[-1,1]")),
     needs=("box+0.3",),
-)  # fmt: skip
+)
 
 OCCNERF = Preset(
     name="occnerf",
@@ -304,11 +267,10 @@ OCCNERF = Preset(
     source="tiangexiang/OccNeRF 1cb1ef3 eval.py (unpack_to_image to psnr_metric, eval_model)",
     prepare=_boxed("box+0.3", truncated, truncated, both=True),
     measures=_measures(
-        "occnerf", _psnr, "pooled", _map_ssim(SKIMAGE_MAP, SKIMAGE), "uniform7-map", "range2", None, "", "",
-        ("body", "visible", "box+0.3", "full"),
+        "occnerf", "pooled", {"uniform7-map": _occnerf_ssim}, regions=("body", "visible", "box+0.3", "full")
     ),
     needs=("box+0.3", "body", "visible"),
-)  # fmt: skip
+)
 
 GAUHUMAN = Preset(
     name="gauhuman",
@@ -316,40 +278,30 @@ GAUHUMAN = Preset(
     source="skhu101/GauHuman 732ec0d render.py:61-91, utils/image_utils.py:17-19, utils/loss_utils.py; "
     "tiangexiang/OccFusion f41e091 stage1.py:302-351",
     prepare=_boxed("box+0.05", _clamped, _clamped, both=False),
-    measures=_measures(
-        "gauhuman", _channels_psnr, "channels", _whole_ssim(SPLATTING), "gauss11-zero", "range1",
-        _whole_lpips("vgg", "[0,1]"), "vgg", "[0,1]", ("full",),
-    ),
+    measures=_measures("gauhuman", "channels", {"gauss11-zero": _whole_ssim(SPLATTING)}, ("vgg", "[0,1]")),
     needs=("box+0.05",),
-)  # fmt: skip
+)
 
 GS_AVATAR_ZJU = Preset(
     name="3dgs-avatar-zju",
     about="the whole frame as rendered, not clamped",
     source="mikeqzy/3dgs-avatar-release fc39bc5 utils/general_utils.py:221-291",
     prepare=_floats,
-    measures=_measures(
-        "3dgs-avatar-zju", _psnr, "pooled", _whole_ssim(SKIMAGE), "uniform7", "range2",
-        _whole_lpips("vgg", "[-1,1]"), "vgg", "[-1,1]", ("full",),
-    ),
-)  # fmt: skip
+    measures=_measures("3dgs-avatar-zju", "pooled", {"uniform7": _whole_ssim(SKIMAGE)}, ("vgg", "[-1,1]")),
+)
 
 INSTANTAVATAR = Preset(
     name="instantavatar",
     about="the whole frame read back from 8-bit PNG; torchmetrics as of its time, and the SSIM of later releases",
     source="tijiang13/InstantAvatar 3cdfd49 eval.py:14-33,94-105; also aipixel/GaussianAvatar d981c62 eval.py:16-35",
     prepare=_prepare_rounded,
-    measures=(
-        *_measures(
-            "instantavatar", _psnr, "pooled", _whole_ssim(TORCHMETRICS_CROP), "gauss11-crop5", "range1",
-            _whole_lpips("alex", "[0,1]"), "alex", "[0,1]", ("full",),
-        ),
-        Measure(
-            _unpainted("ssim", "instantavatar-gauss11", "range1"), _whole_ssim(TORCHMETRICS), SSIM_FORMS["gauss11"],
-            ("full",),
-        ),
+    measures=_measures(
+        "instantavatar",
+        "pooled",
+        {"gauss11-crop5": _whole_ssim(TORCHMETRICS_CROP), "gauss11": _whole_ssim(TORCHMETRICS)},
+        ("alex", "[0,1]"),
     ),
-)  # fmt: skip
+)
 
 GTU_MASK = Preset(
     name="gtu-mask",
@@ -358,7 +310,7 @@ GTU_MASK = Preset(
     prepare=_floats,
     # its PSNR of masked images, corrected by the log of the mask's area, is the PSNR over the mask's pixels
     measures=_measures(
-        "gtu-mask", _psnr, "pooled", _gtu_ssim, "gauss11-crop5", "range1", _gtu_lpips, "alex", "[-1,1]", ("body",)
+        "gtu-mask", "pooled", {"gauss11-crop5": _gtu_ssim}, ("alex", "[-1,1]"), ("body",), lpips_of=_gtu_lpips
     ),
     needs=("body",),
 )
