@@ -28,6 +28,10 @@ class Metric:
     def arrow(self) -> str:
         return "↑" if self.higher_is_better else "↓"
 
+    def head(self, where: str = "") -> str:
+        """The head of a column: "PSNR hidden ↑"."""
+        return " ".join(filter(None, (self.title, where, self.arrow)))
+
     def text(self, value: float) -> str:
         """A value as a table shows it: "—" when absent, "∞" without any error."""
         if math.isnan(value):

@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from ihbench.errors import BadInput
 from ihbench.files import atomic
@@ -29,6 +29,8 @@ from ihbench.record.store import RunFolder
 if TYPE_CHECKING:
     from ihbench.scoring.scoring import ViewScores
 
+Key = TypeVar("Key")
+Value = TypeVar("Value")
 TRACEBACK = "traceback.txt"  # of a run that failed, in its folder
 Rows = Mapping[str, Mapping[Identity, Mean]]  # row name -> identity -> mean over the scene's test views
 Group = tuple[str, str, str, str]  # protocol, its digest, profile, which data
@@ -125,12 +127,17 @@ class RunResult:
         return f"real data ({self.about.variant})"
 
 
+def grouped(pairs: Iterable[tuple[Key, Value]]) -> dict[Key, list[Value]]:
+    """Key -> the values beside it, both in the order given."""
+    groups: dict[Key, list[Value]] = {}
+    for key, value in pairs:
+        groups.setdefault(key, []).append(value)
+    return groups
+
+
 def by_group(results: Iterable[RunResult]) -> dict[Group, list[RunResult]]:
     """Runs that may stand in one table, in the order given."""
-    groups: dict[Group, list[RunResult]] = {}
-    for result in results:
-        groups.setdefault(result.group, []).append(result)
-    return groups
+    return grouped((result.group, result) for result in results)
 
 
 def group_row(row: str, group: str) -> str:

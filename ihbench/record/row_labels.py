@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ihbench.record.results import RunResult
+from ihbench.record.results import RunResult, grouped
 
 
 def by_label(runs: Sequence[RunResult]) -> dict[str, list[RunResult]]:
@@ -14,13 +14,8 @@ def by_label(runs: Sequence[RunResult]) -> dict[str, list[RunResult]]:
 
 def by_configuration(runs: Sequence[RunResult]) -> dict[str, list[RunResult]]:
     """Runs by the label alone, without what is told beside it: that views are missing."""
-    codes: dict[str, set[str]] = {}
-    for run in runs:
-        codes.setdefault(run.method, set()).add(run.identity.code)
-    found: dict[str, list[RunResult]] = {}
-    for run in runs:
-        found.setdefault(_label(run, several_codes=len(codes[run.method]) > 1), []).append(run)
-    return found
+    codes = grouped((run.method, run.identity.code) for run in runs)
+    return grouped((_label(run, several_codes=len({*codes[run.method]}) > 1), run) for run in runs)
 
 
 def _with_views(label: str, runs: Sequence[RunResult]) -> str:

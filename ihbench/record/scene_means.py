@@ -4,32 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import TypeVar
 
 from ihbench.metrics import Identity, Mean, mean_over_frames
-from ihbench.record.results import RunResult
-
-T = TypeVar("T")
-
-
-def by_scene(values: Iterable[tuple[str, T]]) -> dict[str, list[T]]:
-    """Scene -> its values, one for each run, from pairs of both."""
-    groups: dict[str, list[T]] = {}
-    for scene, value in values:
-        groups.setdefault(scene, []).append(value)
-    return groups
+from ihbench.record.results import RunResult, grouped
 
 
 def seed_means(values: Iterable[tuple[str, float]]) -> dict[str, float]:
     """Scene -> mean of its values; NaN where one is."""
-    return {scene: math.fsum(group) / len(group) for scene, group in by_scene(values).items()}
+    return {scene: math.fsum(group) / len(group) for scene, group in grouped(values).items()}
 
 
 def scene_means(runs: Iterable[RunResult], identity: Identity, row: str | None = None) -> dict[str, Mean]:
     """Scene -> mean over its runs (seeds), absent and infinite ones included. `row` names another row of the runs'
     scores than the method's own, such as a calibration row or a group of test views."""
     rows = ((run.scene, run.rows.get(row or run.method, {})) for run in runs)
-    scored = by_scene((scene, means[identity]) for scene, means in rows if identity in means)
+    scored = grouped((scene, means[identity]) for scene, means in rows if identity in means)
     return {scene: mean_over_frames(means) for scene, means in scored.items()}
 
 

@@ -13,7 +13,7 @@ from ihbench.document.document import Block, Heading, Paragraph, Table, Words, b
 from ihbench.metrics import Identity
 from ihbench.metrics.identity import Metric
 from ihbench.metrics.statistics import Interval, holm, mean_interval, paired_test
-from ihbench.record.results import RunResult
+from ihbench.record.results import RunResult, grouped
 from ihbench.record.scene_means import per_scene, seed_means
 from ihbench.reports.general.clock import clock_notes, one_clock
 from ihbench.reports.general.content import data_words
@@ -29,9 +29,7 @@ Found = list[tuple[str, CellOutcome]]  # variant and outcome of every run
 
 def write(suite: AblationSuite, found: Found) -> tuple[list[Block], dict[str, Any]]:
     """The document, and its numbers for programs (strict JSON). One table for each protocol."""
-    protocols: dict[str, Found] = {}
-    for variant, outcome in found:
-        protocols.setdefault(outcome.cell.request.protocol.name, []).append((variant, outcome))
+    protocols = grouped((outcome.cell.request.protocol.name, (variant, outcome)) for variant, outcome in found)
     blocks: list[Block] = [Heading(2, f"Ablation: {suite.title}")]
     tables = []
     for protocol, cells in protocols.items():
@@ -40,7 +38,9 @@ def write(suite: AblationSuite, found: Found) -> tuple[list[Block], dict[str, An
         tables.append(numbers)
     if len(tables) > 1:
         blocks += _severities(suite, tables)
-    failures = [_failure(outcome) for _, outcome in found if not outcome.done]
+    failures = [
+        f"{o.cell.name}: {o.problem if o.result is None else o.result.outcome}" for _, o in found if not o.done
+    ]
     if failures:
         blocks += [Paragraph("Not done:"), *bullets(failures)]
     if suite.note:
@@ -61,7 +61,7 @@ def _table(suite: AblationSuite, protocol: str, cells: Found) -> tuple[list[Bloc
     headline = done[0].headline
     columns = _columns(done, headline)
     quoted = [m for m in PAPER if any(m in variant.paper for variant in suite.variants)]
-    titles = [f"{i.display.title} {i.region} {i.display.arrow}" for i in columns]
+    titles = [i.display.head(i.region) for i in columns]
     titles += ["fit s"] + [f"paper's {PAPER[m][0]}" for m in quoted]
     blocks.append(Paragraph(("Data: ", *data_words(done[0]), ".")))
     lines: list[tuple[Words, ...]] = []
@@ -71,13 +71,15 @@ def _table(suite: AblationSuite, protocol: str, cells: Found) -> tuple[list[Bloc
         asked = sum(name == variant.name for name, _ in cells)
         scores = {i: _interval(per_scene(having, i)) for i in columns}
         seconds = _interval(_seconds(having)) if one_clock(having) else None
-        cells_shown = [_shown(scores[i], i.display) for i in columns] + [_whole(seconds)]
+        cells_shown = [_shown(scores[i], i.display) for i in columns] + [
+            "—" if seconds is None else f"{seconds.value:.0f}"
+        ]
         cells_shown += [f"{variant.paper[m]:.{PAPER[m][1]}f}" if m in variant.paper else "" for m in quoted]
         counted = f"{len(having)}" if len(having) == asked else f"{len(having)} of {asked}"
         scenes = len({run.scene for run in having})
         lines.append((variant.name, str(scenes), counted, *cells_shown))
         variants[variant.name] = {
-            "switches": {name: _plain(value) for name, value in variant.switches.items()},
+            "switches": {n: list(v) if isinstance(v, tuple) else v for n, v in variant.switches.items()},
             "runs": len(having),
             "asked": asked,
             "scores": {str(i): _numbers(interval) for i, interval in scores.items()},
@@ -86,7 +88,8 @@ def _table(suite: AblationSuite, protocol: str, cells: Found) -> tuple[list[Bloc
             "paper": dict(variant.paper),
         }
     blocks.append(Table(("rung", "scenes", "runs", *titles), tuple(lines)))
-    blocks += bullets([*_left_out(runs), *clock_notes(_timed(runs))])
+    timed = grouped((variant, run) for variant, having in runs.items() for run in having if run.timed)
+    blocks += bullets([*_left_out(runs), *clock_notes(timed)])
     told, compared = _comparisons(suite.comparisons, runs, columns)
     if quoted:
         quoted_from = "The paper's numbers are quoted: its own data, whole images, LPIPS* = 1000 × LPIPS."
@@ -110,16 +113,6 @@ def _left_out(runs: Mapping[str, Sequence[RunResult]]) -> list[str]:
         if omissions:
             lines.append(f"left out by the plan, {variant}: {'; '.join(omissions)}")
     return lines
-
-
-def _timed(runs: Mapping[str, Sequence[RunResult]]) -> dict[str, list[RunResult]]:
-    """Variant -> its runs that have a clock."""
-    found = {}
-    for variant, having in runs.items():
-        timed = [run for run in having if run.timed]
-        if timed:
-            found[variant] = timed
-    return found
 
 
 def _columns(runs: Sequence[RunResult], headline: str) -> list[Identity]:
@@ -156,7 +149,7 @@ def _comparisons(
     found = [row for row in found if any(row["scores"].values())]
     if not found:
         return [], []
-    titles = [f"{i.display.title} {i.region} {i.display.arrow}" for i in columns]
+    titles = [i.display.head(i.region) for i in columns]
     lines: list[tuple[Words, ...]] = []
     for row in found:
         n = max(pair["n"] for pair in row["scores"].values() if pair)
@@ -177,12 +170,9 @@ def _comparisons(
 
 def _of_both(a: Sequence[RunResult], b: Sequence[RunResult]) -> tuple[list[RunResult], list[RunResult]]:
     """The runs of scenes and seeds that both have: one that failed is missing on both sides."""
-    common = {_what(run) for run in a} & {_what(run) for run in b}
-    return [run for run in a if _what(run) in common], [run for run in b if _what(run) in common]
-
-
-def _what(run: RunResult) -> tuple[str, int]:
-    return run.scene, run.seed
+    common = {(run.scene, run.seed) for run in a} & {(run.scene, run.seed) for run in b}
+    first, second = ([run for run in runs if (run.scene, run.seed) in common] for runs in (a, b))
+    return first, second
 
 
 def _paired(a: Mapping[str, float], b: Mapping[str, float]) -> dict[str, float | int | str | None] | None:
@@ -241,7 +231,7 @@ def _severities(suite: AblationSuite, tables: Sequence[Mapping[str, Any]]) -> li
     for variant in suite.variants:
         scores = [table["rungs"].get(variant.name, {}).get("scores", {}).get(first) for table in having]
         lines.append((variant.name, *("—" if s is None else metric.text(s["mean"]) for s in scores)))
-    title = f"{metric.title} {identity.region} {metric.arrow} over protocols"
+    title = f"{metric.head(identity.region)} over protocols"
     return [Heading(3, title), Table(("rung", *(table["protocol"] for table in having)), tuple(lines))]
 
 
@@ -273,19 +263,5 @@ def _shown(interval: Interval | None, metric: Metric) -> str:
     return text
 
 
-def _whole(interval: Interval | None) -> str:
-    return "—" if interval is None else f"{interval.value:.0f}"
-
-
 def _plain_text(value: Any) -> str:
     return "+".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
-
-
-def _plain(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value
-
-
-def _failure(outcome: CellOutcome) -> str:
-    if outcome.result is None:
-        return f"{outcome.cell.name}: {outcome.problem}"
-    return f"{outcome.cell.name}: {outcome.result.outcome}"

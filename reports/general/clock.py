@@ -7,9 +7,8 @@ from collections.abc import Mapping, Sequence
 
 from ihbench.clock.machine import BUSY
 from ihbench.document.document import Words
-from ihbench.record.results import RunResult
+from ihbench.record.results import RunResult, grouped
 from ihbench.record.row_labels import by_label
-from ihbench.record.scene_means import by_scene
 
 UNSTABLE = 0.25  # repeats further apart than this share of their median are called unstable, as in `ihbench kernels`
 
@@ -22,12 +21,11 @@ def by_machine(runs: Sequence[RunResult]) -> dict[str, list[RunResult]]:
     """
     timed = [run for run in runs if run.timed]
     letters = machine_letters(timed)
-    found: dict[str, list[RunResult]] = {}
-    for label, group in by_label(timed).items():
-        for run in group:
-            row = f"{label} on {letters[machine_name(run)]}" if len(letters) > 1 else label
-            found.setdefault(row, []).append(run)
-    return found
+    return grouped(
+        (f"{label} on {letters[machine_name(run)]}" if len(letters) > 1 else label, run)
+        for label, group in by_label(timed).items()
+        for run in group
+    )
 
 
 def machine_letters(runs: Sequence[RunResult]) -> dict[str, str]:
@@ -57,9 +55,7 @@ def one_clock(runs: Sequence[RunResult]) -> bool:
 def unstable(runs: Sequence[RunResult]) -> list[str]:
     """Why the seconds of these runs (one row of a table) are unstable; nothing when they are not known to be."""
     reasons = []
-    apart = max(
-        (_spread(group) for group in by_scene((run.scene, run.fit_seconds) for run in runs).values()), default=0.0
-    )
+    apart = max(map(_spread, grouped((run.scene, run.fit_seconds) for run in runs).values()), default=0.0)
     if apart > UNSTABLE:
         reasons.append(f"repeats {apart:.0%} of their median apart")
     loads = [load for load in map(_load_per_core, runs) if load is not None]
@@ -76,26 +72,18 @@ def clock_notes(rows: Mapping[str, Sequence[RunResult]]) -> list[Words]:
     notes: list[Words] = []
     for name, letter in letters.items():
         here = [run for run in runs if machine_name(run) == name]
-        loads = [found for found in map(_load, here) if found is not None]
+        loads = [run.record.machine.load_average[0] for run in here if run.record.machine.load_average]
         load = f"load average at the start {min(loads):.1f} to {max(loads):.1f}" if loads else "load unknown"
         which = f"machine {letter}" if len(letters) > 1 else "machine"
         notes.append(f"{which}: {name}; {load}")
-    told: dict[str, list[str]] = {}
-    for label, group in rows.items():
-        for reason in unstable(group):
-            told.setdefault(reason, []).append(label)
-    return [*notes, *(f"unstable seconds: {reason}: {'; '.join(labels)}" for reason, labels in told.items())]
+    reasons = grouped((reason, label) for label, group in rows.items() for reason in unstable(group))
+    return [*notes, *(f"unstable seconds: {reason}: {'; '.join(labels)}" for reason, labels in reasons.items())]
 
 
 def _spread(seconds: Sequence[float]) -> float:
     """How far repeats lie apart as a share of their median."""
     middle = statistics.median(seconds)
     return (max(seconds) - min(seconds)) / middle if len(seconds) > 1 and middle > 0 else 0.0
-
-
-def _load(run: RunResult) -> float | None:
-    loads = run.record.machine.load_average
-    return loads[0] if loads else None
 
 
 def _load_per_core(run: RunResult) -> float | None:

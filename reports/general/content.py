@@ -3,7 +3,7 @@ error against run time, what was painted, intervals and paired tests."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,16 +22,15 @@ from ihbench.document.document import (
     strong,
 )
 from ihbench.errors import BadInput
-from ihbench.metrics import Identity, macro_mean
+from ihbench.metrics import Identity
 from ihbench.record.quality_time import Target
 from ihbench.record.results import RunResult, by_group
 from ihbench.record.row_labels import by_label
-from ihbench.record.scene_means import scene_means
 from ihbench.reports.general.clock import one_clock
 from ihbench.reports.general.inpainting import inpainting_section
 from ihbench.reports.general.ledger_table import ledger_section
 from ihbench.reports.general.run_time import across_sizes_section, run_time_section
-from ihbench.reports.general.significance import intervals_section
+from ihbench.reports.general.significance import further_rows, intervals_section, score_cells
 from ihbench.scoring.calibration import DESCRIPTIONS, ROWS
 
 
@@ -72,10 +71,10 @@ def score_tables(results: Sequence[RunResult], presets: Sequence[str] = ()) -> l
             table = _table(runs, columns, headline, with_metric=True)
             found.append(replace(table, title=title))
         for preset in presets:
-            rescored = _under(preset, runs)
-            columns = _preset_columns(rescored)
+            scored = _under(preset, runs)
+            columns = _preset_columns(scored)
             if columns:
-                table = _table(rescored, columns, headline, with_metric=True)
+                table = _table(scored, columns, headline, with_metric=True)
                 found.append(replace(table, title=f"{title}, {preset}"))
     if not found:
         raise BadInput("--fragment: no run that is done has a number here; there is no table to write")
@@ -83,15 +82,16 @@ def score_tables(results: Sequence[RunResult], presets: Sequence[str] = ()) -> l
 
 
 def _under(preset: str, runs: Sequence[RunResult]) -> list[RunResult]:
-    """Those that were scored under a further preset, with its numbers in the place of their own."""
+    """The runs that were scored under a preset, with its rows in place of their own."""
     return [replace(run, rows=run.presets[preset]) for run in runs if preset in run.presets]
 
 
 def _preset_columns(runs: Sequence[RunResult]) -> list[Identity]:
     """Identities with a number in any row."""
-    rows = [means for run in runs for means in run.rows.values()]
-    every = dict.fromkeys(i for means in rows for i in means)
-    return [i for i in every if any(i in means and not means[i].absent for means in rows)]
+    every = [row for run in runs for row in run.rows.values()]
+    return [
+        i for i in dict.fromkeys(i for row in every for i in row) if any(i in r and not r[i].absent for r in every)
+    ]
 
 
 def _group(runs: list[RunResult], presets: Sequence[str], targets: Sequence[Target]) -> list[Block]:
@@ -117,11 +117,9 @@ def _group(runs: list[RunResult], presets: Sequence[str], targets: Sequence[Targ
             blocks.append(Heading(3, f"{shown.title} {shown.arrow}{f' ({shown.unit})' if shown.unit else ''}"))
             first = metric == identities[0].metric
             blocks.append(_table(done, columns, headline, with_costs=first))
-    blocks.append(
-        Paragraph(
-            f"Mean over test views of a scene, then over scenes ({_scenes(done)}). Headline region: {headline}."
-        )
-    )
+    scenes = ", ".join(sorted({run.scene for run in done}))
+    told = f"Mean over test views of a scene, then over scenes ({scenes}). Headline region: {headline}."
+    blocks.append(Paragraph(told))
     blocks += _definitions(identities)
     present = [row for row in ROWS if any(row in run.rows for run in done)]
     blocks += bullets([*(f"{row}: {DESCRIPTIONS[row]}" for row in present), *_remarks(done)])
@@ -142,20 +140,16 @@ def data_words(run: RunResult) -> tuple[str | Span, ...]:
 
 def _preset(name: str, runs: list[RunResult], headline: str) -> list[Block]:
     """The table of one further preset, over the runs that were scored under it."""
-    rescored = _under(name, runs)
+    scored = _under(name, runs)
     blocks: list[Block] = [Heading(3, f"preset {name}")]
-    if not rescored:
+    if not scored:
         return [*blocks, Paragraph(f"No run was scored under {name}: ihbench report --preset {name}")]
-    identities = list(dict.fromkeys(i for run in rescored for i in run.own))
-    columns = _preset_columns(rescored)
+    identities = list(dict.fromkeys(i for run in scored for i in run.own))
+    columns = _preset_columns(scored)
     if columns:
-        blocks.append(_table(rescored, columns, headline, with_metric=True))
-    absent = {
-        f"absent: {i.display.title} of {name}: {mean.reason}"
-        for run in rescored
-        for i, mean in run.own.items()
-        if mean.absent
-    }
+        blocks.append(_table(scored, columns, headline, with_metric=True))
+    own = ((i, mean) for run in scored for i, mean in run.own.items())
+    absent = {f"absent: {i.display.title} of {name}: {mean.reason}" for i, mean in own if mean.absent}
     return [*blocks, *_definitions(identities), Bullets(("scored from the runs' 8-bit renders", *sorted(absent)))]
 
 
@@ -174,7 +168,7 @@ def _definitions(identities: Sequence[Identity]) -> list[Block]:
 
 
 def _table(
-    runs: Sequence[RunResult],
+    runs: list[RunResult],
     columns: Sequence[Identity],
     headline: str,
     *,
@@ -190,47 +184,29 @@ def _table(
     head: list[Words] = ["method", "scenes", "seeds", *titles, *costs]
     lines: list[tuple[Words, ...]] = []
     for label, group in by_label(runs).items():
-        cells = [
-            label,
-            str(len({r.scene for r in group})),
-            ", ".join(sorted({str(r.seed) for r in group})),
-        ]
-        cells += [_cell(group, i) for i in columns]
+        method = group[0].method
+        about = (str(len({r.scene for r in group})), ", ".join(sorted({str(r.seed) for r in group})))
+        own: list[str] = []
         if with_costs:
             alike = one_clock(group)  # seconds of several machines have no mean
-            cells += [_mean_of(group, name) if alike else "—" for name in ("fit_seconds", "total_seconds")]
-            cells.append(_largest(group, "peak_mb"))
-        lines.append(tuple(cells))
-        method = group[0].method
-        further = [row for run in group for row in run.rows if row.startswith(f"{method} [")]
-        for row in dict.fromkeys(further):  # groups of test views that the protocol scores apart
+            own = [_mean_of(group, name) if alike else "—" for name in ("fit_seconds", "total_seconds")]
+            own.append(f"{max(run.about.peak_mb or 0.0 for run in group):.0f}")
+        lines.append((label, *about, *score_cells(group, columns, method), *own))
+        for row in further_rows(group):
             name = label + row.removeprefix(method)
-            lines.append((name, cells[1], cells[2], *(_cell(group, i, row) for i in columns), *([""] * len(costs))))
+            lines.append((name, *about, *score_cells(group, columns, row), *([""] * len(costs))))
     for row in ROWS:
-        alike = {run.scene: run for run in runs if row in run.rows}  # one is as good as another
-        if alike:
-            numbers = [_cell(alike.values(), i, row) for i in columns]
-            lines.append((emphasis(row), str(len(alike)), "", *numbers, *([""] * len(costs))))
+        scenes = {run.scene for run in runs if row in run.rows}
+        if scenes:
+            lines.append(
+                (emphasis(row), str(len(scenes)), "", *score_cells(runs, columns, row), *([""] * len(costs)))
+            )
     return Table(tuple(head), tuple(lines), left=3)
-
-
-def _cell(runs: Iterable[RunResult], identity: Identity, row: str | None = None) -> str:
-    """Mean over seeds within a scene, then over scenes; `row` as for `scene_means`."""
-    means = scene_means(runs, identity, row)
-    return identity.display.text(macro_mean(means).value) if means else "—"
 
 
 def _mean_of(runs: list[RunResult], key: str) -> str:
     known = [value for run in runs if (value := getattr(run.about, key)) is not None]
     return f"{sum(known) / len(known):.0f}" if known else "—"
-
-
-def _largest(runs: list[RunResult], key: str) -> str:
-    return f"{max(getattr(run.about, key) for run in runs):.0f}"
-
-
-def _scenes(runs: list[RunResult]) -> str:
-    return ", ".join(sorted({run.scene for run in runs}))
 
 
 def _remarks(runs: list[RunResult]) -> list[str]:

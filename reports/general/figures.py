@@ -17,8 +17,7 @@ from ihbench.metrics.identity import METRICS
 from ihbench.metrics.statistics import Interval, interval_ends
 from ihbench.record import outputs
 from ihbench.record.quality_time import QualityCurve, error_of, pareto_set
-from ihbench.record.results import RunResult, by_group
-from ihbench.record.scene_means import by_scene
+from ihbench.record.results import RunResult, by_group, grouped
 from ihbench.record.schema import plain_name
 from ihbench.reports.general.configurations import Configuration, configurations, short_value, sweeps
 from ihbench.reports.general.run_time import (
@@ -305,11 +304,11 @@ def _mean_curve(found: dict[tuple[str, int], QualityCurve]) -> list[tuple[float,
     end = max(float(c.seconds[-1]) for c in found.values())
     times = np.geomspace(start, end, GRID) if start < end else np.array([start])
     times[0], times[-1] = start, end  # rounding must not put the first one before the first point
-    scenes = by_scene((scene, curve.at(times)) for (scene, _), curve in found.items())
-    means = np.stack([np.mean(values, 0) for values in scenes.values()], -1)  # [times, scenes]
+    by_scene = grouped((scene, curve.at(times)) for (scene, _), curve in found.items())
+    means = np.stack([np.mean(values, 0) for values in by_scene.values()], -1)  # [times, scenes]
     known = np.isfinite(means).all(-1)
     times, means = times[known], means[known]
-    low, high = interval_ends(means, LEVEL) if len(scenes) > 1 else np.full((2, len(times)), np.nan)
+    low, high = interval_ends(means, LEVEL) if len(by_scene) > 1 else np.full((2, len(times)), np.nan)
     return [
         (float(t), float(v), float(a), float(b)) for t, v, a, b in zip(times, means.mean(-1), low, high, strict=True)
     ]

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from rich.cells import cell_len, set_cell_size
 
 from ihbench.errors import visible
-from ihbench.metrics import Identity, macro_mean
+from ihbench.metrics import Identity
 from ihbench.record.results import TRACEBACK, RunResult, by_group
 from ihbench.record.row_labels import by_label
-from ihbench.record.scene_means import scene_means
 from ihbench.reports.general.clock import one_clock
+from ihbench.reports.general.significance import further_rows, score_cells
 from ihbench.scoring.calibration import ROWS
 
 WIDTH = 80
@@ -61,7 +61,7 @@ def _group(runs: Sequence[RunResult], width: int) -> list[str]:
     own = [run.own for run in done]
     present = [i for i in in_headline if any(i in means and not means[i].absent for means in own)]
     rows = _rows(done, present)
-    heads = [f"{i.display.title} {i.display.arrow}" for i in present] + ["fit s"]
+    heads = [i.display.head() for i in present] + ["fit s"]
     table = [(visible(name), cells) for name, cells in [(f"region {headline}", heads), *rows]]
     sizes = [max(cell_len(cells[k]) for _, cells in table) for k in range(len(heads))]
     kept = list(range(len(heads)))
@@ -90,22 +90,13 @@ def _rows(done: Sequence[RunResult], identities: Sequence[Identity]) -> list[tup
     rows = []
     for label, group in by_label(done).items():
         method = group[0].method
-        further = dict.fromkeys(row for run in group for row in run.rows if row.startswith(f"{method} ["))
-        seconds = [run.about.fit_seconds for run in group]
-        known = [value for value in seconds if value is not None]
+        known = [run.fit_seconds for run in group if run.timed]
         fit = f"{sum(known) / len(known):.0f}" if known and one_clock(group) else "—"
-        rows.append((label, [*_cells(group, identities, method), fit]))
-        rows += [(label + row.removeprefix(method), [*_cells(group, identities, row), ""]) for row in further]
+        rows.append((label, [*score_cells(group, identities, method), fit]))
+        further = further_rows(group)
+        rows += [(label + row.removeprefix(method), [*score_cells(group, identities, row), ""]) for row in further]
     bounds = [row for row in ROWS if any(row in run.rows for run in done)]
-    return [*rows, *((row, [*_cells(done, identities, row), ""]) for row in bounds)]
-
-
-def _cells(runs: Sequence[RunResult], identities: Sequence[Identity], row: str) -> list[str]:
-    means = [scene_means(runs, identity, row) for identity in identities]
-    return [
-        identity.display.text(macro_mean(found).value) if found else "—"
-        for identity, found in zip(identities, means, strict=True)
-    ]
+    return [*rows, *((row, [*score_cells(done, identities, row), ""]) for row in bounds)]
 
 
 def _cut(name: str, room: int) -> str:

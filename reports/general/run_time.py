@@ -26,11 +26,11 @@ from ihbench.record.quality_time import (
     round_targets,
     time_to_quality,
 )
-from ihbench.record.results import RunResult
-from ihbench.record.scene_means import by_scene, per_scene, seed_means
+from ihbench.record.results import RunResult, grouped
+from ihbench.record.scene_means import per_scene, seed_means
 from ihbench.reports.general.clock import clock_notes
 from ihbench.reports.general.configurations import Configuration, configurations
-from ihbench.reports.general.significance import LEVEL
+from ihbench.reports.general.significance import LEVEL, interval_text
 
 ON_THE_CURVE = ("psnr", "flip")  # targets are chosen for these where none is stated
 SPREAD = f"{LEVEL:.0%}"
@@ -86,19 +86,15 @@ def work_points(configs: Sequence[Configuration], identity: Identity, scenes: Se
 
 def seconds_interval(runs: Sequence[RunResult], key: str = "fit_seconds") -> Interval:
     """Mean seconds with its interval: over scenes (each the mean of its repeats), or over repeats of one scene."""
-    seconds = by_scene((run.scene, float(getattr(run.about, key))) for run in runs)
+    seconds = grouped((run.scene, float(getattr(run.about, key))) for run in runs)
     repeats = {str(k): value for k, value in enumerate(next(iter(seconds.values())))}
     return mean_interval(seconds if len(seconds) > 1 else repeats, LEVEL)
 
 
 def curves(configuration: Configuration, identity: Identity) -> dict[tuple[str, int], QualityCurve]:
     """(scene, seed) -> the run's curve; runs without such a curve are left out."""
-    found = {}
-    for run in configuration.runs:
-        curve = curve_of(run.curve, identity)
-        if len(curve.values):
-            found[run.scene, run.seed] = curve
-    return found
+    found = {(run.scene, run.seed): curve_of(run.curve, identity) for run in configuration.runs}
+    return {run: curve for run, curve in found.items() if len(curve.values)}
 
 
 def curve_identities(configs: Sequence[Configuration]) -> list[Identity]:
@@ -108,10 +104,8 @@ def curve_identities(configs: Sequence[Configuration]) -> list[Identity]:
 
 def times_to(target: float, found: Mapping[tuple[str, int], QualityCurve], scenes: Sequence[str]) -> dict[str, float]:
     """Scene -> seconds to the quality, the median over its seeds: `NEVER` where half or more never get there."""
-    times = by_scene(
-        (scene, time_to_quality(curve, target)) for (scene, _), curve in found.items() if scene in scenes
-    )
-    return {scene: median(seconds) for scene, seconds in times.items()}
+    by_scene = grouped((s, time_to_quality(curve, target)) for (s, _), curve in found.items() if s in scenes)
+    return {scene: median(times) for scene, times in by_scene.items()}
 
 
 def standing(runs: Iterable[RunResult]) -> str:
@@ -168,10 +162,8 @@ def across_sizes_section(results: Sequence[RunResult]) -> list[Block]:
 
 def same_protocol(results: Sequence[RunResult]) -> dict[tuple[str, str], list[RunResult]]:
     """(protocol, data) -> finished runs under it, whatever their profile and image size, where there are several."""
-    found: dict[tuple[str, str], list[RunResult]] = {}
-    for run in results:
-        if run.status == "done" and run.timed:
-            found.setdefault((run.identity.protocol_without("size"), run.data), []).append(run)
+    timed = (run for run in results if run.status == "done" and run.timed)
+    found = grouped(((run.identity.protocol_without("size"), run.data), run) for run in timed)
     return {
         key: runs
         for key, runs in found.items()
@@ -184,12 +176,11 @@ def _cost_table(configs: Sequence[Configuration], identities: Sequence[Identity]
     all_rows, (configs, scenes) = configs, comparable(configs)
     points = {i: {p.configuration.label: p for p in work_points(configs, i, scenes)} for i in columns}
     columns = [i for i in columns if points[i]]
-    best: dict[str, list[str]] = {}
-    for i in columns:
-        having = list(points[i].values())
-        chosen = pareto_set([p.seconds.value for p in having], [p.error.value for p in having])
-        for k in chosen:
-            best.setdefault(having[k].configuration.label, []).append(i.display.title)
+    front = {
+        i: pareto_set([p.seconds.value for p in row.values()], [p.error.value for p in row.values()])
+        for i, row in points.items()
+    }
+    best = grouped(([*points[i]][k], i.display.title) for i in columns for k in front[i])
     on_gpu = any(_device_mb(run) > 0 for c in configs for run in c.runs)
     rows: list[tuple[Words, ...]] = []
     for c in configs:
@@ -197,17 +188,15 @@ def _cost_table(configs: Sequence[Configuration], identities: Sequence[Identity]
         cells = [
             c.label,
             str(len(runs)),
-            _interval(seconds_interval(runs), "{:.3g}"),
+            interval_text(seconds_interval(runs), "{:.3g}".format),
             f"{seconds_interval(runs, 'total_seconds').value:.0f}",
             f"{max(run.about.peak_mb or 0.0 for run in runs):.0f}",
         ]
         cells += [f"{max(_device_mb(run) for run in runs):.0f}"] if on_gpu else []
-        for i in columns:
-            point = points[i].get(c.label)
-            cells.append("—" if point is None else _scored(point.value, i))
+        cells += [i.display.text(points[i][c.label].value.value) if c.label in points[i] else "—" for i in columns]
         cells.append(", ".join(best.get(c.label, [])) or "—")
         rows.append(tuple(cells))
-    metrics = [f"{i.display.title} {i.display.arrow}" for i in columns]
+    metrics = [i.display.head() for i in columns]
     known = [seconds_interval([run for run in c.runs if run.scene in scenes]) for c in configs]
     kinds = sorted({interval.method for interval in known if math.isfinite(interval.low)})
     head = ["method", "runs", f"fit s [{SPREAD}]" if kinds else "fit s", "total s", "peak MB"]
@@ -229,20 +218,27 @@ def _quality_times(configs: Sequence[Configuration], headline: str, targets: Seq
         return [Paragraph("No run has a quality-time curve (curve.jsonl).")]
     without = [run.folder.name for c in configs for run in c.runs if not run.curve]
     notes: list[Words] = [f"without a readable curve.jsonl: {', '.join(without)}"] if without else []
+    configs, scenes = comparable(configs)
+    views = standing(run for c in configs for run in c.runs)
     return [
-        *_time_table(configs, known, headline, targets),
-        *_area_table(configs, known),
-        *_end_table(configs, known, headline),
+        *_time_table(configs, scenes, views, known, headline, targets),
+        *_area_table(configs, scenes, views, known),
+        *_end_table(configs, scenes, views, [i for i in known if i.region == headline and i.metric in ON_THE_CURVE]),
         *bullets(notes),
     ]
 
 
 def _time_table(
-    configs: Sequence[Configuration], known: Sequence[Identity], headline: str, targets: Sequence[Target]
+    configs: Sequence[Configuration],
+    scenes: Sequence[str],
+    views: str,
+    known: Sequence[Identity],
+    headline: str,
+    targets: Sequence[Target],
 ) -> list[Block]:
-    configs, scenes = comparable(configs)
     if not targets:
-        targets = _chosen_targets(configs, known, headline)
+        first = {i.metric: i for i in reversed(known) if i.region == headline}
+        targets = [Target(m, v) for m in ON_THE_CURVE if m in first for v in _round_ones(configs, first[m])]
     columns: list[tuple[Target, Identity]] = []
     missing: list[Words] = []
     for target in targets:
@@ -261,7 +257,6 @@ def _time_table(
         where = "" if i.region == headline else f" {i.region}"
         unit = " dB" if metric.unit == "dB" else ""
         head.append(f"{metric.title}{where} {sign} {target.value * metric.scale:g}{unit}")
-    views = standing(run for c in configs for run in c.runs)
     told = (
         f"Seconds of fitting until the quality was first reached on {views} test views (region "
         f"{headline} where none is named); where the table over all views says otherwise, the cell says so. Median "
@@ -278,24 +273,11 @@ def _time_table(
     ]
 
 
-def _chosen_targets(configs: Sequence[Configuration], known: Sequence[Identity], headline: str) -> list[Target]:
-    chosen = []
-    for metric in ON_THE_CURVE:
-        for i in known:
-            if (i.metric, i.region) == (metric, headline):
-                chosen += [Target(metric, value) for value in _round_ones(configs, i)]
-                break
-    return chosen
-
-
 def _round_ones(configs: Sequence[Configuration], identity: Identity) -> list[float]:
     """Round qualities that the curves pass, none that the table lacks as long as there are such."""
     every = [(c, scene, curve) for c in configs for (scene, _), curve in curves(c, identity).items()]
-    kept = []
-    for c, scene, curve in every:
-        most = in_table(c, identity, (scene,))[scene]
-        bound = np.fmin if curve.higher_is_better else np.fmax
-        kept.append(replace(curve, values=bound(curve.values, most)))
+    bound = np.fmin if identity.display.higher_is_better else np.fmax
+    kept = [replace(v, values=bound(v.values, in_table(c, identity, (s,))[s])) for c, s, v in every]
     return round_targets(kept) or round_targets([curve for *_, curve in every])
 
 
@@ -325,10 +307,10 @@ def _time_cell(configuration: Configuration, target: float, identity: Identity, 
     return f"{shown} {views}{says}" if says else shown
 
 
-def _end_table(configs: Sequence[Configuration], known: Sequence[Identity], headline: str) -> list[Block]:
+def _end_table(
+    configs: Sequence[Configuration], scenes: Sequence[str], views: str, columns: Sequence[Identity]
+) -> list[Block]:
     """Where the curves end beside what the table has over all views; nothing where they agree as printed."""
-    configs, scenes = comparable(configs)
-    columns = [i for i in known if i.region == headline and i.metric in ON_THE_CURVE]
     rows: list[tuple[Words, ...]] = []
     for c in configs:
         cells = [_end_cell(c, i, scenes) for i in columns]
@@ -336,17 +318,13 @@ def _end_table(configs: Sequence[Configuration], known: Sequence[Identity], head
             rows.append((c.label, *(cell or "as in the table" for cell in cells)))
     if not rows:
         return []
-    views = standing(run for c in configs for run in c.runs)
     told = (
         f"The last point of the curves, on {views} test views, and the same avatars over all test views, as in the "
         "table: mean over scenes of the mean over seeds. By so much the curves, the times and the areas are off."
     )
-    head = [f"{i.display.title} {i.region} {i.display.arrow}" for i in columns]
-    return [
-        Heading(3, "Where the curves end, and what the table has"),
-        Table(("method", *head), tuple(rows)),
-        Paragraph(told),
-    ]
+    head = ("method", *(i.display.head(i.region) for i in columns))
+    title = "Where the curves end, and what the table has"
+    return [Heading(3, title), Table(head, tuple(rows)), Paragraph(told)]
 
 
 def _end_cell(configuration: Configuration, identity: Identity, scenes: Sequence[str]) -> str:
@@ -363,30 +341,25 @@ def _end_cell(configuration: Configuration, identity: Identity, scenes: Sequence
     return f"{metric.text(end)}, in the table {metric.text(whole)} ({sign}{metric.text(abs(end - whole))})"
 
 
-def _area_table(configs: Sequence[Configuration], known: Sequence[Identity]) -> list[Block]:
-    configs, scenes = comparable(configs)
+def _area_table(
+    configs: Sequence[Configuration], scenes: Sequence[str], views: str, known: Sequence[Identity]
+) -> list[Block]:
     columns: list[tuple[Identity, float, float]] = []
-    for metric in ON_THE_CURVE:
-        for i in known:
-            if i.metric != metric:
-                continue
-            found = [v for c in configs for (scene, _), v in curves(c, i).items() if scene in scenes]
-            start, end = common_window(found)
-            if math.isfinite(start):
-                columns.append((i, start, end))
+    for i in (i for metric in ON_THE_CURVE for i in known if i.metric == metric):
+        start, end = common_window([v for c in configs for (s, _), v in curves(c, i).items() if s in scenes])
+        if math.isfinite(start):
+            columns.append((i, start, end))
     if not columns:
         return []
-    rows = []
-    for c in configs:
-        cells = [_area_cell(curves(c, i), i, start, end, scenes) for i, start, end in columns]
-        rows.append((c.label, *cells))
-    head = [f"{i.display.title} {i.region} {i.display.arrow}" for i, _, _ in columns]
+    rows = [
+        (c.label, *(_area_cell(curves(c, i), i, start, end, scenes) for i, start, end in columns)) for c in configs
+    ]
+    head = [i.display.head(i.region) for i, _, _ in columns]
     windows = sorted({f"{_seconds(start)} to {_seconds(end)}" for _, start, end in columns})
     told = (
         f"Mean of the metric over the logarithm of fitting time, from {'; '.join(windows)}: from the latest first "
         "checkpoint of any run to the end of the longest fit; a finished fit keeps its last value. Mean over scenes."
     )
-    views = standing(run for c in configs for run in c.runs)
     title = f"Area under the quality-time curve, on {views} test views"
     return [Heading(3, title), Table(("method", *head), tuple(rows)), Paragraph(told)]
 
@@ -395,23 +368,12 @@ def _area_cell(
     found: Mapping[tuple[str, int], QualityCurve], identity: Identity, start: float, end: float, scenes: Sequence[str]
 ) -> str:
     areas = ((scene, area_under_curve(curve, start, end)) for (scene, _), curve in found.items() if scene in scenes)
-    known = by_scene((scene, area) for scene, area in areas if math.isfinite(area))
-    return identity.display.text(mean_interval(known, LEVEL).value) if known else "—"
+    by_scene = grouped((scene, area) for scene, area in areas if math.isfinite(area))
+    return identity.display.text(mean_interval(by_scene, LEVEL).value) if by_scene else "—"
 
 
 def _seconds(value: float, unit: str = " s") -> str:
     return "never" if value == NEVER else f"{value:.3g}{unit}"
-
-
-def _interval(interval: Interval, form: str) -> str:
-    shown = form.format(interval.value)
-    if math.isfinite(interval.low):
-        shown += f" [{form.format(interval.low)}, {form.format(interval.high)}]"
-    return shown
-
-
-def _scored(interval: Interval, identity: Identity) -> str:
-    return identity.display.text(interval.value)
 
 
 def _device_mb(run: RunResult) -> float:

@@ -6,14 +6,14 @@ Frames of one person are not independent: the scene is the unit, and every numbe
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from ihbench.document.document import Block, Heading, Paragraph, Table, Words, bullets
-from ihbench.metrics import Identity
+from ihbench.metrics import Identity, macro_mean
 from ihbench.metrics.identity import Metric
-from ihbench.metrics.statistics import holm, mean_interval, paired_test, smallest_detectable_difference
+from ihbench.metrics.statistics import Interval, holm, mean_interval, paired_test, smallest_detectable_difference
 from ihbench.record.results import RunResult
-from ihbench.record.scene_means import per_scene
+from ihbench.record.scene_means import per_scene, scene_means
 
 LEVEL = 0.95
 ALPHA = 0.05
@@ -42,19 +42,32 @@ def intervals_section(
                 continue
             interval = mean_interval(found, LEVEL)
             methods.add(interval.method)
-            text = i.display.text
-            shown = text(interval.value)
-            if math.isfinite(interval.low):
-                shown += f" [{text(interval.low)}, {text(interval.high)}]"
-            cells.append(shown)
+            cells.append(interval_text(interval, i.display.text))
         rows.append((label, *cells))
-    head = ("method", *(f"{i.display.title} {i.display.arrow}" for i in columns))
+    head = ("method", *(i.display.head() for i in columns))
     return [
         Heading(3, f"{headline}: mean over scenes and {LEVEL:.0%} interval"),
         Table(head, tuple(rows)),
         Paragraph(f"Intervals: {'; '.join(sorted(methods))}."),
         *bullets([line for i in columns for line in _comparisons(values[i], i.display)]),
     ]
+
+
+def interval_text(interval: Interval, text: Callable[[float], str]) -> str:
+    """ "24.65 [23.90, 25.40]"; the value alone where there is no interval."""
+    ends = f" [{text(interval.low)}, {text(interval.high)}]" if math.isfinite(interval.low) else ""
+    return text(interval.value) + ends
+
+
+def score_cells(runs: Sequence[RunResult], identities: Sequence[Identity], row: str) -> list[str]:
+    """A row of these runs as a table shows it: of each identity the mean over seeds of a scene, then over scenes."""
+    means = [(i, scene_means(runs, i, row)) for i in identities]
+    return [i.display.text(macro_mean(found).value) if found else "—" for i, found in means]
+
+
+def further_rows(runs: Sequence[RunResult]) -> list[str]:
+    """Rows of groups of test views that the protocol scores apart from the method's own."""
+    return list(dict.fromkeys(row for run in runs for row in run.rows if row.startswith(f"{run.method} [")))
 
 
 def _comparisons(values: Mapping[str, Mapping[str, float]], metric: Metric) -> list[str]:
@@ -86,11 +99,10 @@ def _comparisons(values: Mapping[str, Mapping[str, float]], metric: Metric) -> l
             n = len(differences)
             verdict = f"cannot be significant: {n} scenes allow no adjusted p below {min(least, 1):.2g}"
         else:
-            verdict = "significant" if adjusted[label] < ALPHA else "not significant"
-            verdict += (
-                f"; a true difference of {smallest:.{metric.decimals}f}{unit} would be found {POWER:.0%} of the "
+            verdict = (
+                f"{'significant' if adjusted[label] < ALPHA else 'not significant'}; a true difference of "
+                f"{smallest:.{metric.decimals}f}{unit} would be found {POWER:.0%} of the time (t test)"
             )
-            verdict += "time (t test)"
         lines.append(
             f"{metric.title}: {best} against {label}: "
             f"{test.interval.value * metric.scale:+.{metric.decimals}f}{spread}{unit}, "
