@@ -8,13 +8,13 @@ from ihbench.clock.kernel_cache import choose_kernel_cache
 from ihbench.clock.threads import bound_spinning
 from ihbench.version import __version__
 
-__all__ = ["__version__", "ablate", "load_scene", "run", "score"]
+__all__ = ["__version__", "ablate", "frame", "load_scene", "run", "score"]
 
 choose_kernel_cache()  # before numba
 bound_spinning()  # whoever comes in, by whichever module, comes by here, and mostly before torch
 
 if TYPE_CHECKING:
-    from ihbench.api import ablate, load_scene, run, score
+    from ihbench.api import ablate, frame, load_scene, run, score
 
 
 def __getattr__(name: str) -> Any:

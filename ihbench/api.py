@@ -1,4 +1,4 @@
-"""The commands as functions: `ihbench.run`, `load_scene`, `ablate` and `score`, with the command line's own checks.
+"""The commands as functions: `ihbench.run`, `load_scene`, `ablate`, `score` and `frame`, checked as in a terminal.
 
 What is given is held against the types and bounds of the commands' options, after numpy's numbers have
 become Python's and lists tuples. Whatever does not fit is one `BadInput`, before anything is read or written.
@@ -22,6 +22,7 @@ from ihbench.commands.options.scene_choice import NO_CHOICE, OcclusionChoice, Pr
 from ihbench.config_fields import SEEDS, check, replaced, shown
 from ihbench.errors import BadInput
 from ihbench.files.paths import user_path
+from ihbench.record.frame import frame as frame
 from ihbench.record.results import RunResult
 from ihbench.scene.protocol import CHOICES, Protocol, load_protocol
 

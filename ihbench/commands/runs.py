@@ -1,4 +1,4 @@
-"""`ihbench runs list|rm`: what a folder of runs holds, and removing runs from it."""
+"""`ihbench runs list|rm|export`: what a folder of runs holds, removing runs from it, and their numbers as a table."""
 
 from __future__ import annotations
 
@@ -29,9 +29,13 @@ UNITS = ("B", "kB", "MB", "GB", "TB")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Filters(RunFilters, Printing):
+class _Seed(RunFilters):
     seed: int | None = None
     """Only runs with this seed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Filters(_Seed, Printing):
     status: str | None = None
     """Only runs that are running, done, diverged, failed, interrupted, skipped, timeout or damaged."""
 
@@ -51,9 +55,44 @@ class Remove(Filters):
     """Do not ask. Needed where nobody can be asked."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Export(_Seed):
+    """Every number of the runs that are done, view by view: one tidy table, as `ihbench.frame` has it."""
+
+    out: Path
+    """File to write: .csv, or .parquet (needs pyarrow)."""
+
+
 def main(argv: list[str]) -> int:
-    chosen = subcommand({"list": List, "rm": Remove}, argv, "runs", "What a folder of runs holds; removing runs.")
+    about = "What a folder of runs holds; removing runs; their numbers as one table."
+    chosen = subcommand({"list": List, "rm": Remove, "export": Export}, argv, "runs", about)
+    if isinstance(chosen, Export):
+        return _export(chosen)
     return _remove(chosen) if isinstance(chosen, Remove) else _list(chosen)
+
+
+def _export(chosen: Export) -> int:
+    from ihbench.commands.report import say_left_out
+    from ihbench.files.atomic import is_stream
+    from ihbench.record import outputs
+    from ihbench.record.frame import check_suffix, frame_of, write_frame
+    from ihbench.record.index import Index
+
+    outputs.check_file(chosen.out)
+    check_suffix(chosen.out)
+    results, left_out = Index(chosen.runs).results(**_filters(chosen))
+    say_left_out(left_out)
+    table = frame_of(results)
+    if table.empty:
+        raise BadInput(f"no run under {chosen.runs} matches that is done; see ihbench runs list")
+    write_frame(table, chosen.out)
+    said = sys.stderr if is_stream(chosen.out) else sys.stdout  # which may be the file itself
+    print(f"{len(table)} numbers of {table['digest'].nunique()} runs written to {chosen.out}", file=said)
+    return 0
+
+
+def _filters(chosen: _Seed) -> dict[str, Any]:
+    return {name: value for name in FILTERS if (value := getattr(chosen, name, None)) is not None}
 
 
 def _list(chosen: Filters) -> int:
@@ -66,8 +105,7 @@ def _list(chosen: Filters) -> int:
 def _remove(chosen: Remove) -> int:
     from ihbench.record.store import remove_run, writer_of
 
-    filters = [name for name in FILTERS if getattr(chosen, name) is not None]
-    if bool(chosen.run) == bool(filters):
+    if bool(chosen.run) == bool(_filters(chosen)):
         raise BadInput("runs rm: either name run folders, or choose some by filters such as --status failed")
     rows = list(_named(chosen)) if chosen.run else _matching(chosen)
     written = [row for row in rows if writer_of(Path(row["folder"])) is not None]
@@ -114,7 +152,7 @@ def _matching(chosen: Filters) -> list[dict[str, Any]]:
 
     if chosen.status is not None and chosen.status not in (*STATUSES, DAMAGED):
         raise BadInput(f"--status {chosen.status}: {registry.nearest(chosen.status, [*STATUSES, DAMAGED])}")
-    wanted = {name: getattr(chosen, name) for name in FILTERS if getattr(chosen, name) is not None}
+    wanted = _filters(chosen)
     if chosen.status == DAMAGED:
         wanted["status"] = UNREADABLE
     index = Index(chosen.runs)

@@ -6,8 +6,10 @@ import json
 import os
 import shutil
 
+import pandas
 import pytest
 
+from ihbench import frame
 from ihbench.record.store import RunFolder
 from tests.conftest import contents
 from tests.reports.fake_runs import about, identity, write_run
@@ -124,3 +126,29 @@ def test_an_empty_folder_has_no_runs(ihbench, runs):  # noqa: F811
     shutil.rmtree(runs)
     runs.mkdir()
     assert json.loads(ihbench("runs", "list", "--json").out) == {"runs": []}
+
+
+def test_every_number_of_every_view_becomes_one_table(ihbench, runs, monkeypatch):  # noqa: F811
+    write_run(runs, "a", "=1+1", 23.0, 0.9)
+    table = frame(runs)
+    assert table.groupby(["method", "scene"]).size().to_dict() == {
+        ("mine", "a"): 6, ("mine", "b"): 6, ("other", "a"): 6, ("=1+1", "a"): 6,
+    }  # fmt: skip
+    assert len(table.attrs["left_out"]) == 2
+    psnr = table[(table.metric == "psnr") & (table.row == table.method)]
+    assert sorted(psnr.value) == [20.0, 21.0, 22.0, 23.0]
+    assert set(psnr.absent) == {""}
+    assert set(table[table.value.isna()].absent) == {"weights are not there"}
+    assert frame(psnr.folder[:2]).equals(table[table.folder.isin(psnr.folder[:2])].reset_index(drop=True))
+    file = runs / "scores.csv"
+    ihbench("runs", "export", "--out", str(file))
+    back = pandas.read_csv(
+        file, dtype={"camera": str, "digest": str}, keep_default_na=False, na_values={"value": [""]}
+    )
+    unmarked = back.assign(method=back.method.str.lstrip("'"), row=back.row.str.lstrip("'"), folder=table.folder)
+    assert unmarked.equals(table)
+    assert set(back.method) == {"mine", "other", "'=1+1"}  # no formula
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert "pip install pyarrow" in ihbench("runs", "export", "--out", "scores.parquet").err
+    record = next(runs.glob("*/run.json"))
+    assert "part of" in ihbench("runs", "export", "--out", str(record)).err
