@@ -139,29 +139,13 @@ def duration(seconds: float) -> str:
 
 def _rich_bars(stream: TextIO) -> Any:
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        ProgressColumn,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
     from rich.progress import Progress as RichProgress
-    from rich.progress import Task as RichTask
-    from rich.text import Text
-
-    class Note(ProgressColumn):
-        def render(self, task: RichTask) -> Text:
-            return Text(task.fields["note"], style="dim")
-
-    class Description(ProgressColumn):
-        def render(self, task: RichTask) -> Text:
-            return Text(task.description)
 
     return RichProgress(
-        Description(), BarColumn(bar_width=30), MofNCompleteColumn(), TimeElapsedColumn(),
-        TextColumn("left"), TimeRemainingColumn(), Note(),
+        TextColumn("{task.description}", markup=False), BarColumn(bar_width=30), MofNCompleteColumn(),
+        TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}", style="dim", markup=False),
         console=Console(file=stream),
         redirect_stdout=False,  # rich would send stdout to the bar's stream
         redirect_stderr=False,
