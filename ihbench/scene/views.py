@@ -42,8 +42,7 @@ class LazyViews(Sequence[View]):
 
     def __init__(self, make: Callable[[int], View], length: int, held: int = MAX_HELD):
         self._make, self._length, self._held = make, length, held
-        self._kept: OrderedDict[int, View] = OrderedDict()
-        self._coming: dict[int, Future[View]] = {}
+        self._kept: OrderedDict[int, Future[View]] = OrderedDict()
         self._lock = Lock()
 
     def __len__(self) -> int:
@@ -55,29 +54,21 @@ class LazyViews(Sequence[View]):
         if not -self._length <= index < self._length:
             raise IndexError(f"view {index} of {self._length}")
         index %= self._length
+        own: Future[View] = Future()
         with self._lock:
-            if index in self._kept:
-                self._kept.move_to_end(index)
-                return self._kept[index]
-            coming, own = self._coming.get(index), Future()
-            if coming is None:
-                self._coming[index] = own
-        if coming is not None:
-            return coming.result()
-        try:
-            view = self._make(index)
-        except BaseException as error:
-            with self._lock:
-                del self._coming[index]
-            own.set_exception(error)
-            raise
-        with self._lock:
-            self._kept[index] = view
-            while len(self._kept) > self._held:
+            future = self._kept.setdefault(index, own)
+            self._kept.move_to_end(index)
+            if len(self._kept) > self._held:
                 self._kept.popitem(last=False)
-            del self._coming[index]
-        own.set_result(view)
-        return view
+        if future is own:
+            try:
+                own.set_result(self._make(index))
+            except BaseException as error:
+                with self._lock:
+                    self._kept.pop(index, None)
+                own.set_exception(error)
+                raise
+        return future.result()
 
     def preload(self, workers: int = 2) -> Preloading:
         """Begin to make the first `held` items, in order, on threads of their own (image decoding releases the
@@ -154,22 +145,10 @@ class Undistorter:
         self._cv2, self._rule = cv2, rule
         # whole levels: what is known background and what is painted over must not differ by a rounding
         self.background = np.round(np.asarray(rule.background) * 255).astype(np.uint8)  # [3]
-        self._flags = {
-            "nearest": cv2.INTER_NEAREST,
-            "linear": cv2.INTER_LINEAR,
-            "area": cv2.INTER_AREA,
-            "lanczos4": cv2.INTER_LANCZOS4,
-        }
         self._maps = None
         if rule.undistort and camera.distortion is not None and camera.distortion.any():
-            self._maps = cv2.initUndistortRectifyMap(
-                camera.K_opencv,
-                camera.distortion,
-                np.eye(3),
-                camera.K_opencv,
-                (camera.width, camera.height),
-                cv2.CV_16SC2,
-            )
+            K, size = camera.K_opencv, (camera.width, camera.height)
+            self._maps = cv2.initUndistortRectifyMap(K, camera.distortion, np.eye(3), K, size, cv2.CV_16SC2)
         self.size = rule.extent(camera.width, camera.height)
         self.camera = straight_camera(camera, rule)
         # [h, w] pixels whose ray left the original image (a pincushion lens reaches out of it); None for none
@@ -193,7 +172,7 @@ class Undistorter:
         how: str,
     ) -> NDArray[Any]:
         """[h, w] or [h, w, C] of the protocol's size."""
-        return self._cv2.resize(image, self.size, interpolation=self._flags[how])
+        return self._cv2.resize(image, self.size, interpolation=getattr(self._cv2, f"INTER_{how.upper()}"))
 
     def person(
         self,
@@ -219,7 +198,10 @@ class Undistorter:
         if block:
             rows, columns = (slice(s.start // block * block, -(-s.stop // block) * block) for s in (rows, columns))
         share = alpha[rows, columns, None].astype(np.float32) / 255
-        part = self._straight_part(image, rows, columns) * share + self.background * (1 - share)
+        part = image[rows, columns]
+        if self._maps is not None:
+            part = self._cv2.remap(image, *(m[rows, columns] for m in self._maps), self._cv2.INTER_LINEAR)
+        part = part * share + self.background * (1 - share)
         if block:
             small = np.empty((self.size[1], self.size[0], 3), np.uint8)
             small[:] = self.background
@@ -234,13 +216,6 @@ class Undistorter:
 
     def _to_8bit(self, image: NDArray[np.float32]) -> NDArray[np.uint8]:
         return (np.clip(image, 0, 255) + (0.5 if self._rule.to_8bit == "round" else 1e-3)).astype(np.uint8)
-
-    def _straight_part(self, image: NDArray[np.uint8], rows: slice, columns: slice) -> NDArray[np.uint8]:
-        """A rectangle of the undistorted image."""
-        if self._maps is None:
-            return image[rows, columns]
-        maps = (m[rows, columns] for m in self._maps)
-        return self._cv2.remap(image, *maps, self._cv2.INTER_LINEAR)
 
     def touched(
         self,
@@ -287,15 +262,15 @@ def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
     hiding = apply_rule(protocol, capture)
     frames, covered = hiding.frames, hiding.covered
     lenses = LazyViews(lambda camera: Undistorter(capture.camera(camera), protocol.image), n_cameras, held=n_cameras)
-    last_touched: dict[int, tuple[NDArray[np.bool_], NDArray[np.bool_]]] = {}  # most rules hide the same every time
+    last: list[tuple[NDArray[np.bool_], NDArray[np.bool_]]] = []  # most rules hide the same every time
 
     def hidden_of(frame: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Hidden pixels of the original image, and of the protocol's."""
         hidden = hiding.occlusion.hidden(frame)
-        known = last_touched.get(0)
+        known = last[-1] if last else None
         if known is None or known[0] is not hidden:
-            touched = lenses[protocol.train.camera].touched(np.ascontiguousarray(hidden))
-            known = last_touched[0] = (hidden, touched)
+            known = hidden, lenses[protocol.train.camera].touched(np.ascontiguousarray(hidden))
+            last[:] = [known]
         return known
 
     def silhouette(camera: int, frame: int) -> NDArray[np.bool_]:
@@ -341,14 +316,8 @@ def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
             LEVELS[image], mask, lens.camera, capture.body_pose(key.frame), key.frame, key.camera_id, hidden
         )
 
-    return OccludedScene(
-        capture,
-        protocol,
-        hiding,
-        LazyViews(train_view, len(frames)),
-        keys,
-        LazyViews(test_view, len(keys), held=64),
-    )
+    train, test = LazyViews(train_view, len(frames)), LazyViews(test_view, len(keys), held=64)
+    return OccludedScene(capture, protocol, hiding, train, keys, test)
 
 
 def uncovered(scene: OccludedScene) -> OccludedScene:
