@@ -35,17 +35,14 @@ JPEG_QUALITY = 95
 TWELVE_BITS = 4095  # a picture as dark as that in 16 bits holds fewer
 ORIENTATION = 0x0112  # the EXIF tag
 WHITE_IS_ZERO, SAMPLE_FORMAT = 262, 339  # TIFF tags
+CONVERTED = {"P": "RGB", "PA": "RGBA", "1": "L", "La": "LA", "YCbCr": "RGB", "RGBX": "RGB"}  # modes of Pillow
 OTHER_FILES = {  # what a file that is no such picture begins with -> what it is and what helps
     b"v/1\x01": "OpenEXR, which holds linear light; save it as sRGB in PNG",
     b"#?": "Radiance HDR, which holds linear light; save it as sRGB in PNG",
-    b"PF": "PFM, floating-point; save it as sRGB in PNG",
-    b"Pf": "PFM, floating-point; save it as sRGB in PNG",
-    b"II": "a kind of TIFF that is not read (floating-point, perhaps); save it as PNG",
-    b"MM": "a kind of TIFF that is not read (floating-point, perhaps); save it as PNG",
-    b"\x00\x00\x00\x0cjP": "JPEG 2000; save it as PNG",
-    b"\xff\x4f\xff\x51": "JPEG 2000; save it as PNG",
-    b"\x00\x00\x00\x0cJXL": "JPEG XL; save it as PNG",
-    b"\xff\x0a": "JPEG XL; save it as PNG",
+    (b"PF", b"Pf"): "PFM, floating-point; save it as sRGB in PNG",
+    (b"II", b"MM"): "a kind of TIFF that is not read (floating-point, perhaps); save it as PNG",
+    (b"\x00\x00\x00\x0cjP", b"\xff\x4f\xff\x51"): "JPEG 2000; save it as PNG",
+    (b"\x00\x00\x00\x0cJXL", b"\xff\x0a"): "JPEG XL; save it as PNG",
     b"8BPS": "Photoshop; save it as PNG",
     b"%PDF": "PDF; save it as PNG",
     b"\x93NUMPY": "a numpy array; name it .npy",
@@ -186,9 +183,7 @@ def read_picture(path: Path, name: str = "", colours_matter: bool = True) -> Pic
             header["orientation"] = picture.tag_v2.get(ORIENTATION)  # type: ignore[attr-defined]
         tiles = [str(getattr(tile, "args", "")) for tile in getattr(picture, "tile", ())]
         try:
-            frames = (
-                1 if picture.format == "MPO" else getattr(picture, "n_frames", 1)
-            )  # previews of phones come second
+            frames = 1 if picture.format == "MPO" else getattr(picture, "n_frames", 1)  # phones add previews
             if frames == 1:
                 picture.load()
         except Exception as error:  # a damaged file may raise anything
@@ -374,16 +369,10 @@ def _values(picture: Image.Image, tiles: list[str], name: str) -> NDArray[Any]:
             f"{name}: {'floating-point' if mode == 'F' else 'signed or 32-bit'} values, whose white nobody knows; "
             f"expected 8 or 16 bits, save it as sRGB in PNG"
         )
-    if mode in ("P", "PA"):
-        picture = picture.convert("RGBA" if transparent or mode == "PA" else "RGB")
-    elif mode in ("1", "L", "RGB") and transparent:
+    if transparent and mode in ("1", "L", "RGB", "P"):
         picture = picture.convert("RGBA")
-    elif mode == "1":
-        picture = picture.convert("L")
-    elif mode == "La":
-        picture = picture.convert("LA")
-    elif mode in ("YCbCr", "RGBX"):
-        picture = picture.convert("RGB")
+    elif mode in CONVERTED:
+        picture = picture.convert(CONVERTED[mode])
     elif mode not in ("L", "LA", "RGB", "RGBA"):
         raise BadInput(f"{name}: {mode} colours; expected grey or sRGB, convert it and save it as PNG")
     values = np.array(picture)
