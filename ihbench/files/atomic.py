@@ -227,17 +227,14 @@ def _own_stream(path: Path) -> int | None:
 
 def _regular(path: Path) -> os.stat_result | None:
     """What is known of the file that is there, or None where there is none. Raises `OSError` where it may not be
-    replaced: it is a folder, or its owner has taken the right to write away."""
+    replaced: it is a folder or a device, or its owner has taken the right to write away."""
     try:
         about = os.stat(path)
     except (FileNotFoundError, NotADirectoryError):
         return None
-    if stat.S_ISDIR(about.st_mode):
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-    if not stat.S_ISREG(about.st_mode):
-        raise OSError(errno.EISDIR, "a device")
-    if not os.access(path, os.W_OK):
-        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    number = errno.EACCES if stat.S_ISREG(about.st_mode) else errno.EISDIR
+    if number == errno.EISDIR or not os.access(path, os.W_OK):
+        raise OSError(number, os.strerror(number))
     return about
 
 
@@ -265,16 +262,12 @@ def _overwrite(file: Path, data: bytes) -> None:
 
 def _sync_folder(folder: Path) -> None:
     """Make a rename survive a power cut, where the system can do that for folders."""
-    try:
+    with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
-    except OSError:
-        return
-    try:
-        os.fsync(descriptor)
-    except OSError:
-        return
-    finally:
-        os.close(descriptor)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def _explained(error: OSError, path: Path) -> Exception:

@@ -43,7 +43,11 @@ def _composited(color: NDArray, share: NDArray, background: tuple[float, float, 
 
 def read_channels(path: Path) -> NDArray:
     """[H, W, 1 to 4] as `read_image` says, with its alpha channel."""
-    image = _read_array(path) if path.suffix.lower() == ".npy" else _read_picture(path)
+    if path.suffix.lower() == ".npy":
+        image = _read_array(path)
+    else:
+        image = read_picture(path, f"prediction {path}").values
+        image = image if image.dtype == np.uint8 else image.astype(np.float32) / 65535
     if image.ndim == 2:
         image = image[..., None]
     if image.ndim != 3 or image.shape[2] not in (1, 2, 3, 4) or 0 in image.shape:
@@ -52,12 +56,6 @@ def read_channels(path: Path) -> NDArray:
             f"prediction {path}: expected an image [H, W], [H, W, 3] or [H, W, 4], got shape {image.shape}{hint}"
         )
     return image
-
-
-def _read_picture(path: Path) -> NDArray:
-    """[H, W, C] uint8, or float in [0, 1] of 16 bits."""
-    values = read_picture(path, f"prediction {path}").values
-    return values if values.dtype == np.uint8 else values.astype(np.float32) / 65535
 
 
 def _read_array(path: Path) -> NDArray:

@@ -69,7 +69,7 @@ class MethodSpec:
 
     def profile(self, name: str) -> Config:
         """The configuration of a profile. Raises `BadInput` for an unknown one."""
-        profiles: Mapping[str, Config] = self._loaded(self.profiles)
+        profiles: Mapping[str, Config] = self.load(self.profiles)
         if name not in profiles:
             raise BadInput(
                 f"method {self.name!r}: unknown profile {name!r}: {registry.nearest(name, list(profiles))}"
@@ -77,21 +77,18 @@ class MethodSpec:
         return profiles[name]
 
     def create(self, config: Config) -> Method:
-        return self._loaded(self.method)(config)
+        return self.load(self.method)(config)
 
     def omissions(self, config: Config, scene: SceneMeasure) -> list[Omission]:
         """What this scene does not need of this configuration."""
-        return [] if self.leave_out is None else self._loaded(self.leave_out)(config, scene)
+        return [] if self.leave_out is None else self.load(self.leave_out)(config, scene)
 
     def outside(self, config: Config) -> Sequence[Path]:
         """Files and folders beside the package whose content moves numbers."""
-        return () if self.outside_files is None else self._loaded(self.outside_files)(config)
+        return () if self.outside_files is None else self.load(self.outside_files)(config)
 
-    def load(self, part: str) -> Any:
-        """What `ablations`, `stress`, a kernel or a command's `main` names. Raises `BadInput` where there is none."""
-        return self._loaded(part)
-
-    def _loaded(self, part: Any) -> Any:
+    def load(self, part: Any) -> Any:
+        """What `ablations`, `stress`, a kernel or a command's `main` names; an object as it is. Raises `BadInput`."""
         if not isinstance(part, str):
             return part
         module, _, attribute = part.partition(":")

@@ -71,10 +71,8 @@ class Calibration:
             return (np.round(view.image * 255).astype(np.uint8) / 255).astype(np.float32)
         if row == "nearest-frame":
             return self._nearest_frame(view.camera, view.body_pose)
-        if row == "mean-colour-body":
-            return self._mesh(view.camera, view.body_pose, textured=False)
-        if row == "pasted-texture":
-            return self._mesh(view.camera, view.body_pose, textured=True)
+        if row in ("mean-colour-body", "pasted-texture"):
+            return self._mesh(view.camera, view.body_pose, textured=row == "pasted-texture")
         raise ValueError(f"calibration row {row!r}: expected one of {', '.join(ROWS)}")
 
     def _mesh(self, camera: Camera, body_pose: BodyPose, textured: bool) -> NDArray[np.float32]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.metrics.eight_bit import as_float, displayed
-from ihbench.metrics.images import as_image, check_images
+from ihbench.metrics.images import as_image, bounds, check_images, grown
 
 COLUMNS = ("training input", "truth", "prediction", "error x4")
 PAD, LABEL = 6, 18  # px
@@ -95,11 +95,5 @@ def _window(row: SheetRow) -> tuple[slice, slice]:
 
 def _window_of(image: NDArray[np.uint8], margin: int = 4) -> tuple[slice, slice]:
     """The part of an image that differs from its corner's colour."""
-    differs = (np.abs(image.astype(int) - image[0, 0].astype(int)) > 8).any(-1)
-    if not differs.any():
-        return slice(0, image.shape[0]), slice(0, image.shape[1])
-    rows, cols = np.flatnonzero(differs.any(1)), np.flatnonzero(differs.any(0))
-    return (
-        slice(max(rows[0] - margin, 0), min(rows[-1] + margin + 1, image.shape[0])),
-        slice(max(cols[0] - margin, 0), min(cols[-1] + margin + 1, image.shape[1])),
-    )
+    area = bounds((np.abs(image.astype(int) - image[0, 0].astype(int)) > 8).any(-1))
+    return grown(area or (slice(0, image.shape[0]), slice(0, image.shape[1])), margin, image.shape)

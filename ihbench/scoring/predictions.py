@@ -9,9 +9,8 @@ Placeholders: {scene}; {camera}, the data set's name for it; {camera_index} from
 the number of the test view in the protocol's order (all frames of a camera, then the next camera). A number may be
 padded ({frame:06d}). `ihbench score --names` prints the file expected for each view.
 
-Transparent images are composited on the protocol's background. What their colours are, file formats do not say for
-sure: "straight" (the colour itself), "premultiplied" (times alpha) or "composited" (on the background already, beside
-an alpha channel). The colours of half transparent pixels rule out two of these, or the user must say it.
+Transparent images are composited on the protocol's background (see `files.images`). The colours of half transparent
+pixels rule out two of the three ways to write them, or the user must say which it is.
 """
 
 from __future__ import annotations
@@ -21,7 +20,6 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,8 +96,10 @@ def find_predictions(
     that is malformed, leaves the folder or names one file for two views, and when no view has an image.
     """
     patterns = DEFAULT_PATTERNS if pattern is None else (pattern,)
-    best = max((_expected(p, scene, keys) for p in patterns), key=lambda found: _count(root, found[1]))
-    chosen, names = best
+    candidates = {p: _expected(p, scene, keys) for p in patterns}
+    pattern, names = max(
+        candidates.items(), key=lambda item: sum((root / name).is_file() for name in item[1].values())
+    )
     present = {key: root / name for key, name in names.items() if (root / name).is_file()}
     every = image_files(root)
     if not present:
@@ -111,10 +111,10 @@ def find_predictions(
     known = set(present.values())
     for other in scenes:
         if other != scene:
-            known |= {root / name for name in _expected(chosen, other, keys)[1].values()}
+            known |= {root / name for name in _expected(pattern, other, keys).values()}
     return Predictions(
         root,
-        chosen,
+        pattern,
         present,
         tuple(names[key] for key in keys if key not in present),
         tuple(_below(root, p) for p in every if p not in known),
@@ -139,20 +139,18 @@ def size_of_most(
     count = 0
     for scene, keys in scenes.items():
         for one in DEFAULT_PATTERNS if pattern is None else (pattern,):
-            paths = [root / name for name in dict.fromkeys(_expected(one, scene, keys)[1].values())]
+            paths = [root / name for name in dict.fromkeys(_expected(one, scene, keys).values())]
             paths = [path for path in paths if path.is_file()]
             count += len(paths)
-            sides.update(_longer_side(path) for path in paths[:MOST_SIZES])
+            for path in paths[:MOST_SIZES]:
+                array = path.suffix.lower() == ".npy"
+                sides[max(read_channels(path).shape[:2] if array else _header(path).size)] += 1
     return (sides.most_common(1)[0][0], count) if sides else (0, 0)
-
-
-def _longer_side(path: Path) -> int:
-    return max(read_channels(path).shape[:2]) if path.suffix.lower() == ".npy" else max(_header(path).size)
 
 
 def expected_names(pattern: str | None, scene: str, keys: Sequence[TestViewKey]) -> list[str]:
     """The file of each test view below the predictions' folder. Raises `BadInput` for a bad pattern."""
-    names = _expected(pattern or DEFAULT_PATTERNS[0], scene, keys)[1]
+    names = _expected(pattern or DEFAULT_PATTERNS[0], scene, keys)
     return [names[key] for key in keys]
 
 
@@ -212,28 +210,18 @@ def _header(path: Path) -> Header:
     return header_of(path, f"prediction {path}")
 
 
-def _expected(pattern: str, scene: str, keys: Sequence[TestViewKey]) -> tuple[str, dict[TestViewKey, str]]:
-    """The pattern, and the relative path of every view under it."""
+def _expected(pattern: str, scene: str, keys: Sequence[TestViewKey]) -> dict[TestViewKey, str]:
+    """The relative path of every view under a pattern."""
     parsed = NamePattern.parse(pattern, NUMBERS, WORDS)
     names: dict[TestViewKey, str] = {}
     for index, key in enumerate(keys):
-        values: dict[str, Any] = {
-            "scene": scene,
-            "camera": key.camera_id,
-            "camera_index": key.camera,
-            "frame": key.frame,
-            "index": index,
-        }
-        names[key] = parsed.name(values)
+        numbers = {"camera_index": key.camera, "frame": key.frame, "index": index}
+        names[key] = parsed.name({"scene": scene, "camera": key.camera_id, **numbers})
     if len(set(names.values())) < len({(key.camera, key.frame) for key in names}):  # groups may share a view
         raise BadInput(
             f"--pattern {pattern!r}: names one file for several views; use {{camera}} and {{frame}}, or {{index}}"
         )
-    return pattern, names
-
-
-def _count(root: Path, names: dict[TestViewKey, str]) -> int:
-    return sum((root / name).is_file() for name in names.values())
+    return names
 
 
 def _below(root: Path, path: Path) -> str:
