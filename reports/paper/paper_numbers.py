@@ -76,7 +76,7 @@ class Component:
     name: str
     on: tuple[str, ...] = ()  # switches that must all be on
     several: str = ""  # switch that must hold more than one value
-    equal: tuple[tuple[str, str], ...] = ()  # switches that must have one value, and that value
+    equal: Mapping[str, str] = field(default_factory=dict)  # switches that must have one value, and that value
     off: tuple[str, ...] = ()  # switches that must be off, or unknown to the run
     measured_only: bool = False
 
@@ -145,35 +145,20 @@ def paper_table(name: str, file: Path | None = None) -> PaperTable:
 def _table(name: str, raw: dict[str, Any], source: str, digits: dict[str, dict[str, int]]) -> PaperTable:
     groups = tuple(
         Group(
-            name=g["name"],
             columns=tuple(Column(g["name"], key, Digits(**digits[key])) for key in g["metrics"]),
-            protocols=tuple(g["protocols"]),
-            views=g.get("views", ""),
-            note=g.get("note", ""),
-            measured_only=g.get("measured_only", False),
+            **_fields({key: value for key, value in g.items() if key != "metrics"}),
         )
         for g in raw["group"]
     )
     table = PaperTable(
         name=name,
         title=raw["title"],
-        source=f"{source}, {raw['where']}",
         head=raw["head"],
+        source=f"{source}, {raw['where']}",
         groups=groups,
         rows=tuple(_row(row) for row in raw["row"]),
-        components=tuple(
-            Component(
-                c["name"],
-                on=tuple(c.get("on", ())),
-                several=c.get("several", ""),
-                equal=tuple(c.get("equal", {}).items()),
-                off=tuple(c.get("off", ())),
-                measured_only=c.get("measured_only", False),
-            )
-            for c in raw.get("component", ())
-        ),
-        notes=tuple(raw.get("notes", ())),
-        footnotes=dict(raw.get("footnotes", {})),
+        components=tuple(Component(**_fields(component)) for component in raw.get("component", ())),
+        **_fields({key: raw[key] for key in ("notes", "footnotes") if key in raw}),
     )
     parts = [component for component in table.components if not component.measured_only]
     for row in table.rows:
@@ -182,11 +167,15 @@ def _table(name: str, raw: dict[str, Any], source: str, digits: dict[str, dict[s
                 f"row {row.name!r}: expected {len(table.columns)} cells and {len(parts)} components, "
                 f"got {len(row.cells)} and {len(row.components)}"
             )
-        for cell in row.cells:
-            for key in cell.footnotes:
-                if key not in table.footnotes:
-                    raise ValueError(f"row {row.name!r}: unknown footnote {key!r}")
+        for key in (key for cell in row.cells for key in cell.footnotes):
+            if key not in table.footnotes:
+                raise ValueError(f"row {row.name!r}: unknown footnote {key!r}")
     return table
+
+
+def _fields(raw: dict[str, Any]) -> dict[str, Any]:
+    """A part of the file as fields of a dataclass: its lists as tuples."""
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in raw.items()}
 
 
 def _row(raw: dict[str, Any]) -> PaperRow:

@@ -12,22 +12,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from ihbench.document.document import (
-    Block,
-    Heading,
-    Number,
-    Paragraph,
-    RowLabel,
-    Span,
-    Table,
-    bullets,
-    emphasis,
-)
+from ihbench.document.document import Block, Heading, Number, Paragraph, RowLabel, Span, Table, bullets, emphasis
 from ihbench.document.marks import marks_by_interval, marks_by_value
 from ihbench.document.short_names import Footnotes, split_label
 from ihbench.metrics import Identity, Mean, macro_mean
 from ihbench.metrics.statistics import Interval, mean_interval
-from ihbench.record.results import RunResult, group_row
+from ihbench.record.results import RunResult, group_row, grouped
 from ihbench.record.row_choice import EVERYTHING, Choice
 from ihbench.record.row_labels import by_label
 from ihbench.record.scene_means import scene_means
@@ -191,12 +181,9 @@ def _quoted(table: PaperTable, footnotes: Footnotes, as_printed: bool, choice: C
 
 def _by_kind(table: PaperTable, results: Sequence[RunResult]) -> dict[tuple[str, str], list[RunResult]]:
     """(stand-in, profile) -> runs under the table's protocols."""
-    wanted = {protocol for group in table.groups for protocol in group.protocols}
-    by_kind: dict[tuple[str, str], list[RunResult]] = {}
-    for run in results:
-        if _protocol(run) in wanted:
-            by_kind.setdefault((run.about.standin or "", run.identity.profile), []).append(run)
-    return by_kind
+    protocols = {protocol for group in table.groups for protocol in group.protocols}
+    runs = (run for run in results if run.identity.protocol_id in protocols)
+    return grouped(((run.about.standin or "", run.identity.profile), run) for run in runs)
 
 
 def _configured(runs: Sequence[RunResult]) -> list[RunResult]:
@@ -217,7 +204,10 @@ def _measured(
     for standin, profile in sorted(by_kind, key=lambda key: (bool(key[0]), *key)):
         runs = by_kind[standin, profile]
         # runs of one data set under several protocols, digests or variants go into several blocks
-        keys = [_comparable(group, runs) for group in table.groups]
+        by_protocol = grouped((run.identity.protocol_id, run.group) for run in runs)
+        keys = [
+            list(dict.fromkeys(k for name in g.protocols for k in by_protocol.get(name, ()))) for g in table.groups
+        ]
         for k in range(max(map(len, keys))):
             filled = [
                 (group, [run for run in runs if run.group == having[k]])
@@ -226,16 +216,6 @@ def _measured(
             ]
             block = _measured_block(table, filled, standin, profile, region, footnotes, choice)
             yield replace(block, title=f"{block.title}, region {region}") if named else block
-
-
-def _protocol(run: RunResult) -> str:
-    return run.identity.protocol_id
-
-
-def _comparable(group: Group, runs: Sequence[RunResult]) -> list[tuple[str, str, str, str]]:
-    """What runs of this data set there are that may stand in one table, in the order of the table's protocols."""
-    found = [run for name in group.protocols for run in runs if _protocol(run) == name]
-    return list(dict.fromkeys(run.group for run in found))
 
 
 def _measured_block(
@@ -287,7 +267,7 @@ def _measured_block(
                 row = group_row(name, group.views)
                 cells.append(_bound(column, done, row, identity, kind, footnotes))
             columns.append(cells)
-    parts = [_components(table.components, having) for having in labelled.values()]
+    parts = [tuple(_component(part, having) for part in table.components) for having in labelled.values()]
     parts += [(NO,) * len(table.components)] * len(calibrations)
     labels = [*map(RowLabel, labelled), *(RowLabel(name, bound=True) for name in calibrations)]
     rows = [
@@ -416,26 +396,20 @@ def _about(
 # ------------------------------------------------------------------------------------------- components of a method
 
 
-def _components(components: Sequence[Component], runs: Sequence[RunResult]) -> tuple[str, ...]:
-    """Which components these runs of one configuration had. A scene's plan may have left one out: then it is told as
-    not there; where scenes differ, or where the method has no such switch, as unknown."""
-    configs = [run.switches for run in runs]
-    return tuple(_one(component, configs) for component in components)
-
-
-def _one(component: Component, configs: Sequence[Mapping[str, Any]]) -> str:
-    wanted = [*component.on, *(name for name, _ in component.equal)]
-    wanted += [component.several] if component.several else []
-    if any(name not in config for config in configs for name in wanted):
+def _component(component: Component, runs: Sequence[RunResult]) -> str:
+    """Whether these runs of one configuration had it. A scene's plan may have left it out: then it is told as not
+    there; where scenes differ, or where the method has no such switch, as unknown."""
+    names = {*component.on, *component.equal, component.several} - {""}
+    if any(not names <= run.switches.keys() for run in runs):
         return UNKNOWN
-    found = {
-        all(bool(config[name]) for name in component.on)
-        and all(config[name] == value for name, value in component.equal)
-        and not any(config.get(name) for name in component.off)
-        and (not component.several or _several(config[component.several]))
-        for config in configs
+    states = {
+        all(switches[name] for name in component.on)
+        and all(switches[name] == value for name, value in component.equal.items())
+        and not any(switches.get(name) for name in component.off)
+        and (not component.several or _several(switches[component.several]))
+        for switches in (run.switches for run in runs)
     }
-    return UNKNOWN if len(found) != 1 else YES if found.pop() else NO
+    return UNKNOWN if len(states) != 1 else YES if states.pop() else NO
 
 
 def _several(value: Any) -> bool:
