@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
 
@@ -19,7 +19,7 @@ from ihbench.document.marks import ranks
 from ihbench.reports.lint.metric_names import BOUNDED, HeadMetric
 from ihbench.reports.lint.table_reading import Head, Number, ReadCell, ReadTable
 
-MARKED = {"best": "best", "second": "second-best"}
+MARKED = {"best": "best mark", "second": "second-best mark"}
 FACTORS = (1000.0, 100.0)  # between units of one metric
 FAR = 10.0  # times the range of a column: no longer one of its numbers
 OTHER_UNIT = 30.0  # ratio of two columns' medians
@@ -78,9 +78,8 @@ def unknown_heads(table: ReadTable) -> list[Head]:
 
 
 def _lint(table: ReadTable) -> Iterator[Finding]:
-    columns = _columns(table)
     checked = []
-    for column in columns:
+    for column in _columns(table):
         yield from _arrow(column)
         odd = dict(_units(column))
         yield from odd.values()
@@ -106,18 +105,16 @@ def _has_sections(columns: Sequence[_Column]) -> bool:
 
 
 def _columns(table: ReadTable) -> list[_Column]:
-    found = []
+    columns = []
     for k, head in enumerate(table.heads):
-        if head.metric is None:
-            continue
         entries = tuple(
             _Entry(row.label, row.cells[k], number, row.section)
             for row in table.rows
             if row.ranked and (number := row.cells[k].number) is not None
         )
-        if entries:
-            found.append(_Column(head, head.metric, entries))
-    return found
+        if head.metric is not None and entries:
+            columns.append(_Column(head, head.metric, entries))
+    return columns
 
 
 # ---------------------------------------------------------------------------------------------- arrows and units
@@ -125,11 +122,9 @@ def _columns(table: ReadTable) -> list[_Column]:
 
 def _arrow(column: _Column) -> Iterator[Finding]:
     metric = column.metric
-    usual = metric.usual
-    if usual is None:
+    if metric.usual is None:
         return
-    right = "↑" if usual else "↓"
-    better = "higher" if usual else "lower"
+    right, better = ("↑", "higher") if metric.usual else ("↓", "lower")
     if not metric.arrow and not metric.cost:
         yield column.at_head("missing arrow", f"{right} beside {metric.name.upper()}: {better} is better")
     elif metric.arrow and metric.arrow != right:
@@ -143,9 +138,9 @@ def _units(column: _Column) -> Iterator[tuple[int, Finding]]:
     most = max(units, key=lambda unit: (units[unit], unit))
     for k, entry in enumerate(column.entries):
         if entry.number.unit != most:
-            shown, wanted = (f"in {unit}" if unit else "without a unit" for unit in (entry.number.unit, most))
+            shown, expected = (f"in {unit}" if unit else "without a unit" for unit in (entry.number.unit, most))
             what = f"mixed units: {entry.number.shown} {shown}"
-            yield k, column.finding(entry, what, f"{wanted}, as most of the column")
+            yield k, column.finding(entry, what, f"{expected}, as most of the column")
             continue
         factor = _off_by(column, entry) if column.metric.name in BOUNDED else 1.0
         if factor != 1:
@@ -169,45 +164,33 @@ def _off_by(column: _Column, entry: _Entry) -> float:
 
 def _decimals(column: _Column) -> Iterator[Finding]:
     """One number of decimals in a column, or one number of significant digits."""
-    if column.metric.cost:
-        return
-    numbers = [entry.number for entry in column.entries if math.isfinite(entry.value)]
-    decimals = Counter(number.decimals for number in numbers)
-    if len(decimals) <= 1 or len({number.significant for number in numbers}) <= 1:
+    entries = [entry for entry in column.entries if math.isfinite(entry.value)]
+    decimals = Counter(entry.number.decimals for entry in entries)
+    if column.metric.cost or len(decimals) <= 1 or len({entry.number.significant for entry in entries}) <= 1:
         return
     most = max(decimals, key=lambda d: (decimals[d], d))
-    for entry in column.entries:
-        if math.isfinite(entry.value) and entry.number.decimals != most:
-            yield column.finding(
-                entry,
-                f"inconsistent decimals: {entry.number.shown} has {entry.number.decimals}",
-                f"{most}, as most of the column",
-            )
+    for entry in entries:
+        if entry.number.decimals != most:
+            what = f"inconsistent decimals: {entry.number.shown} has {entry.number.decimals}"
+            yield column.finding(entry, what, f"{most}, as most of the column")
 
 
 def _same_metric(columns: Sequence[_Column]) -> Iterator[Finding]:
     """One metric in several columns of a table must be one quantity."""
-    for k, column in enumerate(columns):
+    for column in columns:
         first = next(c for c in columns if c.metric.name == column.metric.name)
-        if first is column or k == 0:
-            continue
         a, b = (median(abs(e.value) for e in c.entries) for c in (first, column))
-        name = column.metric.name.upper()
-        if column.metric.name in BOUNDED and min(a, b) > 0 and max(a, b) / min(a, b) >= OTHER_UNIT:
-            yield column.at_head(
-                f"mixed units: {name} around {b:g} here and around {a:g} in {first.head.title}", "one unit in a table"
-            )
-        elif column.metric.scaled != first.metric.scaled:
-            here, there = ("scaled" if c.metric.scaled else "plain" for c in (column, first))
-            yield column.at_head(
-                f"mixed units: {name} is headed as {here} here and as {there} in {first.head.title}",
-                "one name for one unit",
-            )
-        elif column.metric.unit and first.metric.unit and column.metric.unit != first.metric.unit:
-            yield column.at_head(
-                f"mixed units: {name} in {column.metric.unit} here and in {first.metric.unit} in {first.head.title}",
-                "one unit in a table",
-            )
+        name, metric, other = column.metric.name.upper(), column.metric, first.metric
+        if metric.name in BOUNDED and min(a, b) > 0 and max(a, b) / min(a, b) >= OTHER_UNIT:
+            what, expected = f"around {b:g} here and around {a:g} in", "one unit in a table"
+        elif metric.scaled != other.scaled:
+            here, there = ("scaled" if m.scaled else "plain" for m in (metric, other))
+            what, expected = f"is headed as {here} here and as {there} in", "one name for one unit"
+        elif metric.unit and other.unit and metric.unit != other.unit:
+            what, expected = f"in {metric.unit} here and in {other.unit} in", "one unit in a table"
+        else:
+            continue
+        yield column.at_head(f"mixed units: {name} {what} {first.head.title}", expected)
 
 
 # --------------------------------------------------------------------------------------------------------- marks
@@ -224,75 +207,56 @@ def _marks(columns: Sequence[_Column], paired: bool, apart: bool) -> Iterator[Fi
 def _marks_of(column: _Column, entries: Sequence[_Entry], used: set[str], paired: bool) -> Iterator[Finding]:
     """Marks of rows that are ranked together."""
     higher = column.metric.higher_is_better
-    found = ranks([entry.value for entry in entries], higher)
-    at = {rank: [e for e, r in zip(entries, found, strict=True) if r == rank] for rank in sorted(set(found))}
+    ranked = dict(zip(entries, ranks([entry.value for entry in entries], higher), strict=True))
+    at = {rank: [e for e in entries if ranked[e] == rank] for rank in sorted({*ranked.values()})}
     if len(at) < 2:  # one number, or all equal: nothing is better than something else
         return
-    order = list(at)
-    best, next_best = at[order[0]], at[order[1]]
+    best, next_best = list(at.values())[:2]
     if column.metric.cost:  # often shown beside the quality and not ranked
         used = {entry.cell.mark for entry in column.entries}
-    yield from _one_mark(column, entries, found, "best", best, "best" in used, paired)
+    yield from _one_mark(column, ranked, "best", best, "best" in used, paired)
     tied = [e for e in entries if e not in best and _within_noise(best[0].number, e.number, higher)]
     sharing = [e for e in tied if e.cell.mark == "best"] if all(e.cell.mark == "best" for e in best) else []
     if sharing:  # the next one that is not called best may be called second
-        rest = [(e, rank) for e, rank in zip(entries, found, strict=True) if e not in [*best, *sharing]]
-        next_best = [e for e, rank in rest if rank == min(rank for _, rank in rest)]
+        rest = [e for e in entries if e not in [*best, *sharing]]
+        next_best = [e for e in rest if ranked[e] == min(ranked[e] for e in rest)]
         if not next_best:
             return
     # two best leave no second, and of two numbers the second is the last; who marks it all the same does no harm
     strict = len(best) == 1 and len(entries) > 2 and not tied
-    yield from _one_mark(column, entries, found, "second", next_best, strict and "second" in used, paired)
+    yield from _one_mark(column, ranked, "second", next_best, strict and "second" in used, paired)
 
 
 def _one_mark(
     column: _Column,
-    entries: Sequence[_Entry],
-    ranked: Sequence[int],
+    ranked: Mapping[_Entry, int],
     mark: str,
     right: Sequence[_Entry],  # who deserves it by value
-    wanted: bool,  # whether somebody must have it
+    required: bool,  # whether somebody must have it
     paired: bool,  # marks may be absent for reasons that the table does not show
 ) -> Iterator[Finding]:
-    higher = column.metric.higher_is_better
-    marked = [entry for entry in entries if entry.cell.mark == mark]
-    worse = [e for e, rank in zip(entries, ranked, strict=True) if rank > ranked[entries.index(right[0])]]
-    noisy = [e for e in worse if _within_noise(right[0].number, e.number, higher)]
+    higher, name = column.metric.higher_is_better, MARKED[mark]
+    noisy = [e for e in ranked if ranked[e] > ranked[right[0]] and _within_noise(right[0].number, e.number, higher)]
+    marked = [entry for entry in ranked if entry.cell.mark == mark]
+    with_mark, missing = ([e for e in right if (e in marked) is there] for there in (True, False))
+    wrong = [e for e in marked if e not in right and not (e in noisy and with_mark)]
     names = " and ".join(f"{e.label} ({e.number.shown})" for e in right)
-    wrong = [e for e in marked if e not in right and not (e in noisy and any(r in marked for r in right))]
     for entry in wrong:
-        rank = ranked[entries.index(entry)]
-        yield column.finding(
-            entry,
-            f"wrong {MARKED[mark]} mark: {entry.number.shown} is {_ordinal(rank)} of {len(entries)}",
-            f"the mark on {names}",
-        )
-    having = [entry for entry in right if entry in marked]
-    missing = [entry for entry in right if entry not in marked]
-    if having and missing:
-        for entry in missing:
+        what = f"wrong {name}: {entry.number.shown} is {_ordinal(ranked[entry])} of {len(ranked)}"
+        yield column.finding(entry, what, f"the mark on {names}")
+    for entry in missing:
+        if with_mark:
+            what = f"tie: {entry.number.shown} equals the marked {with_mark[0].label}"
+            yield column.finding(entry, what, f"the {name} here too")
+        elif required and not (wrong or paired or noisy):
             yield column.finding(
-                entry,
-                f"tie: {entry.number.shown} equals the marked {having[0].label}",
-                f"the {MARKED[mark]} mark here too",
+                entry, f"missing {name}", f"{entry.number.shown} marked as {name.removesuffix(' mark')}"
             )
-    elif missing and not wrong and wanted and not paired and not noisy:
-        for entry in missing:
-            yield column.finding(
-                entry, f"missing {MARKED[mark]} mark", f"{entry.number.shown} marked as {MARKED[mark]}"
-            )
-    if paired or not having:
-        return
-    for entry in noisy:
-        # the best row is the second-best one's better, and a best that is marked too claims nothing over it
-        if entry not in marked:
-            yield column.finding(
-                having[0],
-                f"claim within noise: {MARKED[mark]} mark, but {entry.label} ({entry.number.shown}) is not further "
-                "away than their intervals",
-                "no mark, or one on both",
-            )
-            return
+    # the best row is the second-best one's better, and a best that is marked too claims nothing over it
+    rival = next((entry for entry in noisy if entry not in marked), None)
+    if rival and with_mark and not paired:
+        what = f"claim within noise: {name}, but {rival.label} ({rival.number.shown}) is not further away"
+        yield column.finding(with_mark[0], f"{what} than their intervals", "no mark, or one on both")
 
 
 def _within_noise(better: Number, worse: Number, higher: bool) -> bool:

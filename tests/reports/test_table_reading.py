@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 
 from ihbench.errors import BadInput
 from ihbench.reports.lint.latex_reading import latex_grids
-from ihbench.reports.lint.markdown_reading import markdown_grids
 from ihbench.reports.lint.metric_names import head_metric
-from ihbench.reports.lint.table_files import read_tables
+from ihbench.reports.lint.table_files import markdown_grids, read_tables
 from ihbench.reports.lint.table_reading import tables_of
 
 
