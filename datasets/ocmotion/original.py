@@ -15,7 +15,6 @@ Source: boycehbz/CHOMP vis_OcMotion.py. What the `_w2a` sequences share with thi
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -37,14 +36,12 @@ from ihbench.errors import BadInput
 from ihbench.files.paths import user_path
 from ihbench.files.pictures import read_mask, read_rgb, size_of, write_picture
 from ihbench.files.safe_pickle import load_pickle
-from ihbench.registry import nearest
 from ihbench.scene.copy_report import SubjectReport
 
 Array = NDArray[np.float64]
 OneCapture = TypeVar("OneCapture", bound="OneCameraCapture")
 
 SPLITS = ("train", "test")
-SILHOUETTES = ("visible", "mask")  # two names of one thing
 SAME_CAMERA = 1e-4  # largest difference between frames, relative to the largest entry of K, R and t
 FARTHEST = 100.0  # m from the origin: the scenes are rooms
 LARGEST_ROTATION = 4 * np.pi  # rad of one joint; a fit may wind once around, degrees go further
@@ -56,6 +53,7 @@ class OneCameraCapture(CaptureFolder):
 
     dataset = "ocmotion"
     visible_masks = True
+    silhouettes = ("visible", "mask")  # two names of one thing
     frame_names: tuple[str, ...]
     _K: Array  # [3, 3] px, OpenCV's
     _E: Array  # [4, 4] world to camera, m
@@ -68,14 +66,6 @@ class OneCameraCapture(CaptureFolder):
         self.check_index(camera, 0)
         return Camera.from_opencv(self._K, self._E[:3, :3], self._E[:3, 3], *self._image_size)
 
-    @abstractmethod
-    def body_pose(self, frame: int) -> BodyPose: ...
-
-    def vertices(self, frame: int) -> Array:
-        """[V, 3] m, world: the posed body. Needs the body model."""
-        body_pose = self.body_pose(frame)
-        return self.model.pose(body_pose)
-
     def image(self, camera: int, frame: int) -> NDArray[np.uint8]:
         """[H, W, 3] RGB, as stored."""
         path = self.image_path(camera, frame)
@@ -83,8 +73,7 @@ class OneCameraCapture(CaptureFolder):
 
     def silhouette(self, camera: int, frame: int, source: str = "mask") -> NDArray[np.bool_]:
         """[H, W] the visible person: what furniture hides is False. `source` is "visible" or, the same, "mask"."""
-        if source not in SILHOUETTES:
-            raise BadInput(f"silhouette source {source!r}: {nearest(source, list(SILHOUETTES))}")
+        self.check_source(source)
         path = self.mask_path(camera, frame)
         # OccFusion reads a palette's red
         return self.read_picture(path, camera, lambda path: read_mask(path, "first channel"), self._mask_hint)
@@ -227,17 +216,14 @@ class OcMotionCapture(OneCameraCapture):
 
     def body_pose(self, frame: int) -> BodyPose:
         """The frame's SMPL parameters: standard root, world, metres."""
-        person, where = self._at(frame)
+        self.check_index(0, frame)
+        person, where = self._people[frame]
         return metric_pose(
             numbers(person, "pose", (24, 3), where),
             numbers(person, "betas", (10,), where),
             numbers(person, "trans", (3,), where),
             where,
         )
-
-    def _at(self, frame: int) -> tuple[Mapping, str]:
-        self.check_index(0, frame)
-        return self._people[frame]
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,7 @@ from ihbench.datasets.ocmotion.original import (
     ten_betas,
     three_channels,
 )
+from ihbench.datasets.reading.capture_folder import picture_files
 from ihbench.datasets.reading.pickles import write_pickle
 from ihbench.datasets.reading.stored_numbers import described, numbers, stored_camera
 from ihbench.datasets.reading.subject_folders import View
@@ -50,7 +51,6 @@ Array = NDArray[np.float64]
 
 METADATA = "metadata.json"
 NAME_END = "_w2a"
-PICTURES = (".png", ".jpg", ".jpeg")
 NOT_SEQUENCES = ("truth",)  # what a stand-in keeps beside the sequences
 SAME_EXTRINSICS = 1e-3  # files keep float32, and fold the translation in at that precision
 
@@ -123,12 +123,7 @@ class W2aCapture(OneCameraCapture):
         pose = numbers(entry, "poses", (24, 3), where).copy()
         betas, trans = numbers(entry, "betas", (10,), where), numbers(entry, "trans", (3,), where)
         if self._mesh_infos is not None:
-            pose[0] = numbers(
-                self._mesh_infos[name],
-                "Rh",
-                (3,),
-                f"{self.folder / 'mesh_infos.pkl'}: frame {name}",
-            )
+            pose[0] = numbers(self._mesh_infos[name], "Rh", (3,), f"{self.folder / 'mesh_infos.pkl'}: frame {name}")
         return metric_pose(pose, betas, trans, where)
 
     def novel_cameras(self, frame: int) -> list[Camera]:
@@ -172,7 +167,7 @@ class W2aCapture(OneCameraCapture):
 
 
 def _holds(E: Array, own: Array) -> bool:
-    """Whether one of the extrinsics [N, 4, 4] is the wanted one [4, 4]."""
+    """Whether one of the extrinsics [N, 4, 4] is `own` [4, 4]."""
     scale = max(1.0, float(np.abs(own).max()))
     return bool((np.abs(E - own).max((1, 2)) < SAME_EXTRINSICS * scale).any())
 
@@ -207,14 +202,10 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _image_files(folder: Path, may_lack: bool) -> dict[str, Path]:
     """Frame name -> image file, sorted by name."""
-    if not folder.is_dir():
-        if may_lack:
-            return {}
+    if not folder.is_dir() and not may_lack:
         raise BadInput(f"{folder}: no such folder; expected the images of the sequence, NNNNN.png")
     files: dict[str, Path] = {}
-    for path in sorted(folder.iterdir()):
-        if path.suffix.lower() not in PICTURES or path.name.startswith("."):
-            continue
+    for path in picture_files(folder):
         if path.stem in files:
             raise BadInput(f"{path}: frame {path.stem} is there twice, {files[path.stem].name} too; keep one of them")
         if not (path.stem[:5].isascii() and path.stem[:5].isdecimal()):

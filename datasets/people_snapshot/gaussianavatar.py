@@ -33,6 +33,7 @@ from ihbench.datasets.people_snapshot.original import (
     rigid_extrinsic,
     stacked,
 )
+from ihbench.datasets.reading.capture_folder import picture_files
 from ihbench.datasets.reading.stored_numbers import stored_camera
 from ihbench.datasets.reading.subject_folders import SubjectFolders, View, count_files
 from ihbench.errors import BadInput
@@ -45,7 +46,6 @@ from ihbench.scene.copy_report import SubjectReport
 
 SPLITS = ("train", "test")
 IMAGES, MASKS, CAMERA, POSES = "images", "masks", "cam_parms", "smpl_parms.pth"
-PICTURES = (".png", ".jpg", ".jpeg")
 LARGEST_FRAME = 1_000_000  # stems above are no frame numbers (dates, …)
 
 
@@ -109,7 +109,7 @@ class GaussianAvatarCapture(SnapshotPictures):
         stored = [
             Stored(split, row, image)
             for split in SPLITS
-            for row, image in enumerate(_pictures(folder / split / IMAGES))
+            for row, image in enumerate(picture_files(folder / split / IMAGES))  # in the order of the poses
         ]
         if not stored:
             raise BadInput(f"{folder}: no image in train/{IMAGES} or test/{IMAGES}; expected .png or .jpg files")
@@ -203,15 +203,6 @@ class GaussianAvatarCapture(SnapshotPictures):
 def _holds_split(folder: Path) -> bool:
     parts = (folder / POSES).is_file(), (folder / f"{CAMERA}.npz").is_file() or (folder / CAMERA).is_dir()
     return sum((*parts, (folder / IMAGES).is_dir())) >= 2
-
-
-def _pictures(folder: Path) -> list[Path]:
-    """In sorted order of the names, which is the order of the poses."""
-    if not folder.is_dir():
-        return []
-    return sorted(
-        path for path in folder.iterdir() if path.suffix.lower() in PICTURES and not path.name.startswith(".")
-    )
 
 
 def read_poses(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:

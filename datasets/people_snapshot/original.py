@@ -21,8 +21,10 @@ import tempfile
 import threading
 from abc import abstractmethod
 from collections import OrderedDict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,7 +45,6 @@ from ihbench.files import atomic, npz
 from ihbench.files.pictures import above_half, one_line, read_rgb
 from ihbench.files.safe_pickle import load_pickle
 from ihbench.files.spelling import missing_file
-from ihbench.registry import nearest
 from ihbench.scene.copy_report import SubjectReport
 
 if TYPE_CHECKING:
@@ -114,11 +115,6 @@ class SnapshotFolder(CaptureFolder):
         """ "female" or "male" by the folder's name, else "neutral": the SMPL model that the poses belong to."""
         words = re.split(r"[^a-z]+", self.name.lower())
         return next((word for word in words if word in ("female", "male")), "neutral")
-
-    def check_source(self, source: str) -> None:
-        """Raise `BadInput` for another silhouette source than "mask"."""
-        if source != "mask":
-            raise BadInput(f"silhouette source {source!r}: {nearest(source, ['mask'])}")
 
 
 class SnapshotPictures(SnapshotFolder):
@@ -623,47 +619,38 @@ def write_video(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float = 30
     """
     import cv2
 
+    frames = iter(frames)
+    first = next(frames, None)
+    if first is None:
+        raise ValueError("video: expected at least one frame")
+    shape, n = first.shape, 0
+    if len(shape) != 3 or shape[2] != 3 or shape[0] % 2 or shape[1] % 2 or first.dtype != np.uint8:
+        raise ValueError(f"video: expected uint8 RGB frames of even size, got {first.dtype} {shape}")
     with tempfile.TemporaryDirectory() as scratch:
         temporary = Path(scratch) / "video.mp4"
-        writer, shape, n = None, (0, 0, 3), 0
+        codec = cv2.VideoWriter.fourcc(*"mp4v")
+        writer = cv2.VideoWriter(str(temporary), cv2.CAP_FFMPEG, codec, fps, shape[1::-1])
         try:
-            for frame in frames:
-                if writer is None:
-                    shape = frame.shape
-                    if frame.ndim != 3 or shape[2] != 3 or shape[0] % 2 or shape[1] % 2 or frame.dtype != np.uint8:
-                        raise ValueError(f"video: expected uint8 RGB frames of even size, got {frame.dtype} {shape}")
-                    codec = cv2.VideoWriter.fourcc(*"mp4v")
-                    writer = cv2.VideoWriter(str(temporary), cv2.CAP_FFMPEG, codec, fps, shape[1::-1])
-                    if not writer.isOpened():
-                        raise BadInput(f"{path}: OpenCV cannot write MPEG-4 video here; reinstall opencv-python")
+            if not writer.isOpened():
+                raise BadInput(f"{path}: OpenCV cannot write MPEG-4 video here; reinstall opencv-python")
+            for frame in chain([first], frames):
                 if frame.shape != shape:
                     raise ValueError(f"video: expected frames of one size, got {shape} and {frame.shape}")
                 writer.write(cv2.cvtColor(np.ascontiguousarray(frame), cv2.COLOR_RGB2BGR))
                 n += 1
         finally:
-            if writer is not None:
-                writer.release()
-        if not n:
-            raise ValueError("video: expected at least one frame")
+            writer.release()
         if not temporary.is_file() or (written := Video(temporary)).n_frames != n or written.size != shape[:2]:
             raise BadInput(f"{path}: the video came out incomplete; make room on the disk and try again")
         atomic.write_bytes(path, temporary.read_bytes(), durable=False)
 
 
-class _new_hdf5:
+@contextmanager
+def _new_hdf5(path: Path) -> Iterator[h5py.File]:
     """An HDF5 file in memory that takes its name on disk only when it is complete."""
+    import h5py
 
-    def __init__(self, path: Path):
-        import h5py
-
-        self._path = path
-        self._file = h5py.File(path.name, "w", driver="core", backing_store=False)
-
-    def __enter__(self) -> h5py.File:
-        return self._file
-
-    def __exit__(self, kind: object, *_: object) -> None:
-        with self._file as file:
-            file.flush()
-            if kind is None:
-                atomic.write_bytes(self._path, file.id.get_file_image(), durable=False)
+    with h5py.File(path.name, "w", driver="core", backing_store=False) as file:
+        yield file
+        file.flush()
+        atomic.write_bytes(path, file.id.get_file_image(), durable=False)

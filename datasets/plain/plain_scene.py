@@ -28,7 +28,7 @@ from ihbench.body.pose import BodyPose
 from ihbench.body.skeleton import pose_hint
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera, off_orthogonal
-from ihbench.datasets.reading.capture_folder import CaptureFolder, Picture
+from ihbench.datasets.reading.capture_folder import PICTURES, CaptureFolder, Picture, picture_files
 from ihbench.datasets.reading.plausibility import SOFT_VALUES, Outline
 from ihbench.datasets.reading.standin_mark import STANDIN_FILE
 from ihbench.datasets.reading.stored_numbers import numbers
@@ -44,7 +44,6 @@ from ihbench.scene.copy_report import SubjectReport
 Array = NDArray[np.float64]
 
 CAMERAS_FILE, POSES_FILE, BODY_FILE, SCENE_FILE = "cameras.json", "poses.npz", "body.npz", "scene.json"
-IMAGE_ENDINGS = (".png", ".jpg", ".jpeg")
 CAMERA_KEYS = ("K", "R", "t", "width", "height", "distortion", "pixel_center")
 POSE_KEYS = ("frames", "pose", "betas", "transl", "root")
 ROOTS = ("smpl", "zju")
@@ -168,8 +167,7 @@ class PlainCapture(CaptureFolder):
 
     def silhouette(self, camera: int, frame: int, source: str = "mask") -> NDArray[np.bool_]:
         """[H, W] non-zero in masks/. `source` is "mask", there is no other."""
-        if source != "mask":
-            raise BadInput(f"silhouette source {source!r}: {nearest(source, ['mask'])}")
+        self.check_source(source)
         return self._read("masks", camera, frame, lambda path: read_mask(path, "non-zero"))
 
     def content_digest(self, camera: int, frame: int, source: str = "mask") -> bytes:
@@ -190,7 +188,7 @@ class PlainCapture(CaptureFolder):
 
     def stored_pose(self, frame: int) -> BodyPose:
         self.check_index(0, frame)
-        return self._poses.row(frame)
+        return BodyPose(self._poses.pose[frame], self._poses.betas[frame], self._poses.transl[frame])
 
     def label(self, frame: int) -> str:
         return str(self.number(frame))
@@ -212,8 +210,8 @@ class PlainCapture(CaptureFolder):
         key = kind, camera
         if key not in self._listings:
             listing: dict[int, list[Path]] = {}
-            endings = IMAGE_ENDINGS if kind == "images" else (".png",)
-            for path in _pictures(self.picture_folder(kind, camera), endings):
+            endings = PICTURES if kind == "images" else (".png",)
+            for path in picture_files(self.picture_folder(kind, camera), endings):
                 if _is_number(path.stem):
                     listing.setdefault(int(path.stem), []).append(path)
             self._listings[key] = listing
@@ -230,12 +228,6 @@ class PlainCapture(CaptureFolder):
             or_else = " or .jpg" if kind == "images" else ""
             raise BadInput(f"{path}{or_else}: no such file; {POSES_FILE} has frame {number}{self.standin_hint}")
         return self.check_size(paths[0], read(paths[0]), camera)
-
-
-def _pictures(folder: Path, endings: Sequence[str]) -> list[Path]:
-    if not folder.is_dir():
-        return []
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in endings and path.name[0] != ".")
 
 
 def _is_number(stem: str) -> bool:
@@ -329,14 +321,15 @@ class Poses:
         frames, pose, betas, transl = (a[kept] for a in (self.frames, self.pose, self.betas, self.transl))
         return replace(self, frames=frames, pose=pose, betas=betas, transl=transl)
 
-    def row(self, frame: int) -> BodyPose:
-        """One frame as stored, whatever the root."""
-        return BodyPose(self.pose[frame], self.betas[frame], self.transl[frame])
-
 
 def read_poses(path: Path) -> Poses:
     """The SMPL parameters of every frame. Raises `BadInput` naming the array that is not as expected."""
-    arrays = _read_npz(path)
+    if not path.is_file():
+        raise missing_file(path, "expected the poses of every frame in it")
+    arrays = read_npz(path, largest=LARGEST_POSES)
+    for key in arrays:
+        if key not in POSE_KEYS:
+            raise BadInput(f"{path}: unknown array {key!r}: {nearest(key, list(POSE_KEYS))}")
     for key in ("pose", "betas", "transl"):
         if key not in arrays:
             raise BadInput(f"{path}: no array {key!r}; expected pose [N, 72], betas [B] and transl [N, 3]")
@@ -395,16 +388,6 @@ def _floats(arrays: dict[str, NDArray], key: str, path: Path) -> Array:
     return value.astype(np.float64)
 
 
-def _read_npz(path: Path) -> dict[str, NDArray]:
-    if not path.is_file():
-        raise missing_file(path, "expected the poses of every frame in it")
-    arrays = read_npz(path, largest=LARGEST_POSES)
-    for key in arrays:
-        if key not in POSE_KEYS:
-            raise BadInput(f"{path}: unknown array {key!r}: {nearest(key, list(POSE_KEYS))}")
-    return arrays
-
-
 # ----------------------------------------------------------------------------------------------- check
 
 
@@ -441,7 +424,7 @@ def _check_files(capture: PlainCapture, report: SubjectReport) -> None:
         for kind in ("images", "masks"):
             odd = [
                 path
-                for path in _pictures(capture.picture_folder(kind, camera), IMAGE_ENDINGS)
+                for path in picture_files(capture.picture_folder(kind, camera), PICTURES)
                 if not _is_number(path.stem) or (kind == "masks" and path.suffix.lower() != ".png")
             ]
             if odd:

@@ -18,7 +18,9 @@ from ihbench.camera import Camera
 from ihbench.datasets.reading.standin_mark import standin_mark
 from ihbench.errors import BadInput
 from ihbench.files.spelling import missing_file
+from ihbench.registry import nearest
 
+PICTURES = (".png", ".jpg", ".jpeg")
 Picture = TypeVar("Picture", bound=NDArray[Any])
 
 BY_OPTIONS = "(--train-frames, --test-frames)"  # how a frame of a fixed recording is left out
@@ -32,6 +34,7 @@ class CaptureFolder(ABC):
     n_frames: int
     camera_ids: tuple[str, ...]
     visible_masks: bool = False
+    silhouettes: tuple[str, ...] = ("mask",)  # names of the sources
 
     def __init__(self, folder: Path, name: str, body: Body | None = None, root: Path | None = None):
         """`root` holds the stand-in's mark, the folder's parent by default. Raises `BadInput` for a body of another
@@ -146,6 +149,11 @@ class CaptureFolder(ABC):
         """What the files call a frame."""
         return str(frame)
 
+    def check_source(self, source: str) -> None:
+        """Raise `BadInput` for a silhouette source that the capture does not have."""
+        if source not in self.silhouettes:
+            raise BadInput(f"silhouette source {source!r}: {nearest(source, list(self.silhouettes))}")
+
     def check_index(self, camera: int, frame: int) -> None:
         """Raise `BadInput` for a camera or frame that the capture does not have."""
         if not 0 <= camera < len(self.camera_ids):
@@ -159,3 +167,10 @@ class CaptureFolder(ABC):
     @property
     def standin_hint(self) -> str:
         return "; a stand-in holds only the images it was asked for, ask for this one too" if self.standin else ""
+
+
+def picture_files(folder: Path, endings: tuple[str, ...] = PICTURES) -> list[Path]:
+    """Files with one of these endings, sorted by name; none where there is no such folder."""
+    if not folder.is_dir():
+        return []
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in endings and path.name[0] != ".")

@@ -53,15 +53,15 @@ class StandIn(ABC):
         root: Path,
         seed: int,
         subjects: list[str],
-        wanted: Mapping[int, Iterable[int]],  # camera -> frames; what comes in one piece is made whole
+        needed: Mapping[int, Iterable[int]],  # camera -> frames; what comes in one piece is made whole
         progress: Progress | None = None,
     ) -> Path:
-        """Write what is wanted and not yet there below `root`, and return `root`.
+        """Write what is needed and not yet there below `root`, and return `root`.
 
         Interrupted, the same call goes on where it stopped. Raises `BadInput` for an unknown subject, camera or
         frame, a negative seed, and when `root` holds something else.
         """
-        frames_of = {camera: sorted(set(frames)) for camera, frames in sorted(wanted.items())}
+        frames_of = {camera: sorted(set(frames)) for camera, frames in sorted(needed.items())}
         for camera, frames in frames_of.items():
             if not 0 <= camera < cls.n_cameras:
                 raise BadInput(f"stand-in camera {camera}: expected 0 to {cls.n_cameras - 1}")
@@ -130,17 +130,13 @@ def claim(root: Path, version: int, seed: int, body: Body) -> None:
         if present != mark:
             raise BadInput(f"{root}: holds another stand-in ({_differences(present, mark)}); choose another folder")
         return
-    if root.exists() and (not root.is_dir() or any(not _is_litter(entry.name) for entry in root.iterdir())):
+    litter = (f".{STANDIN_FILE}", f".{NAME_PREFIX}", ".DS_Store", "Thumbs.db", "thumbs.db")  # of locks, file browsers
+    if root.exists() and (not root.is_dir() or any(not entry.name.startswith(litter) for entry in root.iterdir())):
         raise BadInput(f"{root}: not an empty folder and not a stand-in; choose another folder")
     with locked(root / f".{STANDIN_FILE}.lock", ADVICE):
         if not path.is_file():
             atomic.write_json(path, mark)
     claim(root, version, seed, body)  # somebody else may have been quicker
-
-
-def _is_litter(name: str) -> bool:
-    """Whether a name is of those that locks, halves of files and file browsers leave."""
-    return name.startswith((f".{STANDIN_FILE}", f".{NAME_PREFIX}", ".DS_Store")) or name.lower() == "thumbs.db"
 
 
 def _differences(present: object, asked: dict[str, object]) -> str:

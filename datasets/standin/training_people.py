@@ -6,7 +6,6 @@ Numbers below `HELD_OUT` are for training, the others for validation.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -195,6 +194,3 @@ def traits(style: outfit.Style) -> NDArray[np.float32]:
     one_hot = [float(known == kind) for kind, every in kinds for known in every]
     lengths = [style.sleeve - 1, style.leg - 1, float(style.beard), style.frequency / 8 - 2]
     return np.array([*(2 * np.ravel(colours) - 1), *lengths, *one_hot], np.float32)
-
-
-DrawPerson = Callable[[int, Body, int], TrainingPerson]

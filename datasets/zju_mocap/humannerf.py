@@ -90,6 +90,7 @@ class HumanNerfCapture(CaptureFolder):
         self.camera_ids = tuple(ids)
         self.n_frames = max(frame for _, frame in self._names) + 1
         self._sizes: dict[int, tuple[int, int]] = {}
+        self._fitted_betas: dict[bytes, NDArray[np.float64]] = {}
 
     def camera(self, camera: int) -> Camera:
         """The camera of its first frame, with its lens distortion; all frames of one share it."""
@@ -128,10 +129,6 @@ class HumanNerfCapture(CaptureFolder):
         if key not in self._fitted_betas:
             self._fitted_betas[key] = betas_of_joints(joints, self.model)
         return self._fitted_betas[key]
-
-    @cached_property
-    def _fitted_betas(self) -> dict[bytes, NDArray[np.float64]]:
-        return {}
 
     @cached_property
     def _average_betas(self) -> NDArray[np.float64] | None:

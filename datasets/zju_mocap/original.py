@@ -35,7 +35,6 @@ from ihbench.files import atomic
 from ihbench.files.pictures import read_mask, read_rgb, size_of, write_picture
 from ihbench.files.safe_pickle import load_npy
 from ihbench.files.spelling import missing_file
-from ihbench.registry import nearest
 from ihbench.scene.copy_report import SubjectReport
 
 FOLDER_PREFIX = "CoreView_"
@@ -97,6 +96,7 @@ class ZjuCapture(CaptureFolder):
     dataset = "zju_mocap"
     layout, prefix = "original", FOLDER_PREFIX
     fits = FITS  # parameter folders, the preferred one first
+    silhouettes = tuple(SILHOUETTES)
     mask_kinds: tuple[str, ...] = ("mask", "mask_cihp")
 
     def __init__(self, folder: Path, body: Body | None = None):
@@ -147,8 +147,7 @@ class ZjuCapture(CaptureFolder):
 
     def silhouette(self, camera: int, frame: int, source: str = "mask") -> NDArray[np.bool_]:
         """[H, W]. `source` is "mask", "mask_cihp" or "union" (either of the two, as HumanNeRF and OccNeRF)."""
-        if source not in SILHOUETTES:
-            raise BadInput(f"silhouette source {source!r}: {nearest(source, list(SILHOUETTES))}")
+        self.check_source(source)
         person = None
         for kind in SILHOUETTES[source]:
             path = self.mask_path(camera, frame, kind)

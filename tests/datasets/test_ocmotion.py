@@ -349,7 +349,7 @@ def test_standin_takes_its_own_body_and_may_lack_images(sequence):
     (sequence / "images" / "00321.png").unlink()
     capture = opened(sequence)
     assert (capture.standin, capture.body, capture.n_frames) == ("stand-in v1 seed 0", "procedural", N_FRAMES)
-    assert capture.vertices(1).shape == load_body().v_template.shape
+    assert capture.model.pose(capture.body_pose(1)).shape == load_body().v_template.shape
     capture.image(0, 2)
     with pytest.raises(BadInput, match=r"images/00321.png: no such file.*a stand-in holds only"):
         capture.image(0, 1)

@@ -215,7 +215,7 @@ def test_poses_in_every_layout(copy, own_body):
     read = read_poses(path)
     np.testing.assert_array_equal(read.frames, [2, 5, 7])
     np.testing.assert_allclose(read.pose, stacked[[1, 2, 0]], atol=1e-7)
-    np.testing.assert_array_equal(read.row(2).transl, poses[0].transl)
+    np.testing.assert_array_equal(read.transl[2], poses[0].transl)
 
 
 def test_the_zju_root_is_understood(tmp_path, own_body):
