@@ -6,6 +6,7 @@ Cameras have no lens distortion left. Views are numbered from 0.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -21,24 +22,22 @@ from ihbench.datasets.zju_mocap import refine as zju_refine
 def zju(handout: Handout) -> Path:
     """The original release's layout, one camera: CoreView_NAME."""
     folder = handout.folder / f"{zju_mocap.FOLDER_PREFIX}{handout.name}"
-    paths = [f"Camera_B1/{number:06d}.png" for number in range(handout.n_views)]
-    zju_mocap.write_annots(folder, handout.cameras[:1], [[path] for path in paths])
-    for view in handout.views():
-        zju_mocap.write_params(folder, view.number, view.body_pose, handout.body)
-        zju_mocap.write_vertices(folder, view.number, handout.body.pose(view.body_pose))
-        zju_mocap.write_frame(folder, paths[view.number], view.image, view.visible * np.uint8(255))
-    return folder
+    return _one_camera(handout, folder, "Camera_B1", zju_mocap.FITS[0], zju_mocap.write_frame)
 
 
 def zju_refined(handout: Handout) -> Path:
     """The refine repack's layout, one camera: my_NAME."""
     folder = handout.folder / f"{zju_refine.PREFIX}{handout.name}"
-    paths = [f"images/00/{number:06d}.png" for number in range(handout.n_views)]
+    return _one_camera(handout, folder, "images/00", zju_refine.PARAMS, zju_refine.write_frame)
+
+
+def _one_camera(handout: Handout, folder: Path, camera: str, fit: str, write_frame: Callable) -> Path:
+    paths = [f"{camera}/{number:06d}.png" for number in range(handout.n_views)]
     zju_mocap.write_annots(folder, handout.cameras[:1], [[path] for path in paths])
     for view in handout.views():
-        zju_mocap.write_params(folder, view.number, view.body_pose, handout.body, zju_refine.PARAMS)
-        zju_mocap.write_vertices(folder, view.number, handout.body.pose(view.body_pose), zju_refine.PARAMS)
-        zju_refine.write_frame(folder, paths[view.number], view.image, view.visible)
+        zju_mocap.write_params(folder, view.number, view.body_pose, handout.body, fit)
+        zju_mocap.write_vertices(folder, view.number, handout.body.pose(view.body_pose), fit)
+        write_frame(folder, paths[view.number], view.image, view.visible * np.uint8(255))
     return folder
 
 

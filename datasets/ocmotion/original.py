@@ -30,11 +30,12 @@ from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera, off_orthogonal
 from ihbench.datasets.reading.capture_folder import CaptureFolder
 from ihbench.datasets.reading.pickles import write_pickle
+from ihbench.datasets.reading.plausibility import readable
 from ihbench.datasets.reading.stored_numbers import described, numbers, stored_camera
 from ihbench.datasets.reading.subject_folders import SubjectFolders, View, count_files
 from ihbench.errors import BadInput
 from ihbench.files.paths import user_path
-from ihbench.files.pictures import read_mask, read_rgb, size_of, write_picture
+from ihbench.files.pictures import read_mask, size_of, write_picture
 from ihbench.files.safe_pickle import load_pickle
 from ihbench.scene.copy_report import SubjectReport
 
@@ -45,7 +46,6 @@ SPLITS = ("train", "test")
 SAME_CAMERA = 1e-4  # largest difference between frames, relative to the largest entry of K, R and t
 FARTHEST = 100.0  # m from the origin: the scenes are rooms
 LARGEST_ROTATION = 4 * np.pi  # rad of one joint; a fit may wind once around, degrees go further
-LISTED_PROBLEMS = 5  # of one kind, then "and so on"
 
 
 class OneCameraCapture(CaptureFolder):
@@ -65,11 +65,6 @@ class OneCameraCapture(CaptureFolder):
         """The calibrated view; no distortion."""
         self.check_index(camera, 0)
         return Camera.from_opencv(self._K, self._E[:3, :3], self._E[:3, 3], *self._image_size)
-
-    def image(self, camera: int, frame: int) -> NDArray[np.uint8]:
-        """[H, W, 3] RGB, as stored."""
-        path = self.image_path(camera, frame)
-        return self.read_picture(path, camera, read_rgb, f"expected the image of frame {frame}")
 
     def silhouette(self, camera: int, frame: int, source: str = "mask") -> NDArray[np.bool_]:
         """[H, W] the visible person: what furniture hides is False. `source` is "visible" or, the same, "mask"."""
@@ -122,18 +117,7 @@ class Sequences(SubjectFolders[OneCapture], Generic[OneCapture]):
         frames = range(capture.n_frames)
         images, masks = ({f: path(0, f) for f in frames} for path in (capture.image_path, capture.mask_path))
         there = count_files(report, {"image": images, "mask": masks})
-        posed: set[int] = set()
-        unreadable = []
-        for frame in frames:
-            try:
-                capture.body_pose(frame)
-                posed.add(frame)
-            except BadInput as error:
-                unreadable.append(str(error))
-        for text in list(dict.fromkeys(unreadable))[:LISTED_PROBLEMS]:
-            report.problem(text)
-        if len(unreadable) > LISTED_PROBLEMS:
-            report.problem(f"and so on: the body's parameters are unusable at {len(unreadable)} frames")
+        posed = readable(frames, capture.body_pose, lambda frame: f"frame {frame}", report).keys()
         return sorted((0, frame) for frame in there["image"] & there["mask"] & posed)
 
 

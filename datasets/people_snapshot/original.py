@@ -42,7 +42,7 @@ from ihbench.datasets.reading.stored_numbers import numbers
 from ihbench.datasets.reading.subject_folders import SubjectFolders, View
 from ihbench.errors import BadInput
 from ihbench.files import atomic, npz
-from ihbench.files.pictures import above_half, one_line, read_rgb
+from ihbench.files.pictures import above_half, one_line
 from ihbench.files.safe_pickle import load_pickle
 from ihbench.files.spelling import missing_file
 from ihbench.scene.copy_report import SubjectReport
@@ -131,11 +131,6 @@ class SnapshotPictures(SnapshotFolder):
     @abstractmethod
     def read_mask(path: Path) -> NDArray[np.bool_]:
         """[H, W], True = person. Raises `BadInput`."""
-
-    def image(self, camera: int, frame: int) -> NDArray[np.uint8]:
-        """[H, W, 3] RGB, as stored."""
-        self.check_index(camera, frame)
-        return self.read_picture(self.image_path(frame), camera, read_rgb, f"expected the image of frame {frame}")
 
     def silhouette(self, camera: int, frame: int, source: str = "mask") -> NDArray[np.bool_]:
         """[H, W], True where the stored mask is above one half. `source` is "mask"."""

@@ -17,6 +17,7 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -113,7 +114,7 @@ class PlainCapture(CaptureFolder):
         self._listings: dict[tuple[str, int], dict[int, list[Path]]] = {}
         numbers = [int(number) for number in self._poses.frames]
         self.n_frames = len(numbers)
-        pictured = {number for camera in range(len(self.camera_ids)) for number in self.files("images", camera)}
+        pictured = {*chain(*(self.files("images", camera) for camera in range(len(self.camera_ids))))}
         kept = [row for row, number in enumerate(numbers) if number in pictured]
         if self.standin or not kept:  # a stand-in lacks images that were not asked for
             kept = list(range(len(numbers)))
@@ -416,19 +417,16 @@ def _check_files(capture: PlainCapture, report: SubjectReport) -> None:
                     f"{len(lacking)} {text}; the first is frame {min(lacking)}: copy the files, or leave "
                     f"these frames out of {POSES_FILE}"
                 )
-        for listing in (images, masks):
+        for kind, listing in (("images", images), ("masks", masks)):
             for number, paths in listing.items():
                 if len(paths) > 1:
                     names = " and ".join(path.name for path in paths)
                     report.problem(f"{paths[0].parent}: {names} are both frame {number}; keep one of them")
-        for kind in ("images", "masks"):
-            odd = [
-                path
-                for path in picture_files(capture.picture_folder(kind, camera), PICTURES)
-                if not _is_number(path.stem) or (kind == "masks" and path.suffix.lower() != ".png")
-            ]
+            pictures = picture_files(capture.picture_folder(kind, camera))
+            png_only = kind == "masks"
+            odd = [p for p in pictures if not _is_number(p.stem) or (png_only and p.suffix.lower() != ".png")]
             if odd:
-                ending = "png" if kind == "masks" else "png or .jpg"
+                ending = "png" if png_only else "png or .jpg"
                 report.problem(f"{odd[0]}: {len(odd)} such names are ignored; expected <frame number>.{ending}")
     report.files, report.missing = counts, missing
     for kind in ("images", "masks"):
@@ -444,9 +442,7 @@ def _check_files(capture: PlainCapture, report: SubjectReport) -> None:
 
 def _check_numbers(capture: PlainCapture, report: SubjectReport) -> None:
     """Whether the rows of poses.npz and the files of the images count the same frames."""
-    pictured = sorted(
-        {number for camera in range(len(capture.camera_ids)) for number in capture.files("images", camera)}
-    )
+    pictured = sorted({*chain(*(capture.files("images", camera) for camera in range(len(capture.camera_ids))))})
     rows = sorted({*capture.without_image, *(capture.number(frame) for frame in range(capture.n_frames))})
     if not pictured or pictured == rows or capture.standin:
         return

@@ -17,6 +17,7 @@ from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.datasets.reading.standin_mark import standin_mark
 from ihbench.errors import BadInput
+from ihbench.files.pictures import read_rgb
 from ihbench.files.spelling import missing_file
 from ihbench.registry import nearest
 
@@ -35,6 +36,7 @@ class CaptureFolder(ABC):
     camera_ids: tuple[str, ...]
     visible_masks: bool = False
     silhouettes: tuple[str, ...] = ("mask",)  # names of the sources
+    image_hint = "expected the image of frame {}"  # for messages
 
     def __init__(self, folder: Path, name: str, body: Body | None = None, root: Path | None = None):
         """`root` holds the stand-in's mark, the folder's parent by default. Raises `BadInput` for a body of another
@@ -111,8 +113,11 @@ class CaptureFolder(ABC):
     @abstractmethod
     def body_pose(self, frame: int) -> BodyPose: ...
 
-    @abstractmethod
-    def image(self, camera: int, frame: int) -> NDArray[np.uint8]: ...
+    def image(self, camera: int, frame: int) -> NDArray[np.uint8]:
+        """[H, W, 3] RGB, as stored."""
+        self.check_index(camera, frame)
+        path = self.files_of(camera, frame, self.silhouettes[0])[0]
+        return self.read_picture(path, camera, read_rgb, self.image_hint.format(frame))
 
     @abstractmethod
     def silhouette(self, camera: int, frame: int, source: str = "mask") -> NDArray[np.bool_]: ...

@@ -171,11 +171,11 @@ def examine(
         frames = sorted({frame for _, frame in views}) or list(
             range(0, capture.n_frames, max(1, capture.n_frames // 3))
         )
-        posed = _usable(frames, outline, lambda frame: f"frame {capture.label(frame)}", report)
+        posed = readable(frames, outline, lambda frame: f"frame {capture.label(frame)}", report)
         plausible = _check_shape(capture, report)
         aimed = set(_check_placement(capture, usable, list(posed.values())[:: max(1, len(posed) // 8)], report))
     _check_images(capture, views, samples, report)
-    masks = _usable(views, lambda v: capture.silhouette(*v), lambda v: _views(capture, [v]), report)
+    masks = readable(views, lambda v: capture.silhouette(*v), lambda v: _views(capture, [v]), report)
     if not masks:
         return
     _check_softness(capture, masks, report)
@@ -213,7 +213,7 @@ def _evenly(items: Sequence[Any], count: int) -> list[Any]:
     return [items[k] for k in sorted(set(picked.tolist()))]
 
 
-def _usable(
+def readable(
     items: Iterable[Any], read: Callable[[Any], Any], name: Callable[[Any], str], report: SubjectReport
 ) -> dict:
     """What can be read of the items, by item. The first few that cannot are named, the others counted."""

@@ -12,11 +12,11 @@ from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_array, csr_array, diags_array
 
 from ihbench.body import Body
 from ihbench.body.skeleton import JOINT_INDEX
+from ihbench.body.uv import nearest_on_chart
 from ihbench.datasets.standin.noise import fractal_noise, value_noise
 from ihbench.render.zbuffer import rasterize, vertex_normals
 
@@ -552,5 +552,5 @@ def bake(body: Body, style: Style, size: int = TEXTURE_SIZE) -> tuple[NDArray[np
     texture = np.zeros((size, size, 3), np.float32)
     labels = np.zeros((size, size), np.uint8)
     texture[hit], labels[hit] = albedo(chart, style), part_labels(chart, style)
-    row, column = np.asarray(distance_transform_edt(~hit, return_distances=False, return_indices=True))
-    return np.ascontiguousarray(texture[row, column]), np.ascontiguousarray(labels[row, column])
+    nearest = nearest_on_chart(hit)
+    return texture.reshape(-1, 3)[nearest], labels.ravel()[nearest]

@@ -13,7 +13,7 @@ Not every copy holds betas: then they follow from tpose_joints, which are linear
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -24,12 +24,12 @@ from numpy.typing import NDArray
 from ihbench.body import Body, from_zju_root, zju_root
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
-from ihbench.datasets.reading.capture_folder import CaptureFolder, Picture
+from ihbench.datasets.reading.capture_folder import CaptureFolder
 from ihbench.datasets.reading.pickles import write_pickle
 from ihbench.datasets.reading.stored_numbers import described, extrinsic, numbers
 from ihbench.datasets.reading.subject_folders import SubjectFolders, View, count_files
 from ihbench.errors import BadInput
-from ihbench.files.pictures import read_mask, read_rgb, size_of, write_picture
+from ihbench.files.pictures import read_mask, size_of, write_picture
 from ihbench.files.safe_pickle import load_pickle
 from ihbench.scene.copy_report import SubjectReport
 
@@ -68,6 +68,7 @@ class HumanNerfCapture(CaptureFolder):
     """
 
     dataset, variant = "zju_mocap", "humannerf"
+    image_hint = "cameras.pkl lists it"
 
     def __init__(self, folder: Path, body: Body | None = None):
         super().__init__(folder, folder.name, body)
@@ -141,22 +142,16 @@ class HumanNerfCapture(CaptureFolder):
         """(camera, frame) of the views that the copy lists, sorted."""
         return sorted((self.camera_ids.index(camera), frame) for camera, frame in self._names)
 
-    def image(self, camera: int, frame: int) -> NDArray[np.uint8]:
-        """[H, W, 3] RGB, as stored."""
-        return self._read("images", camera, frame, read_rgb)
-
     def silhouette(self, camera: int, frame: int, source: str = "mask") -> NDArray[np.bool_]:
         """[H, W]. The preparation has joined the original's masks: "mask" and "union" are the same here."""
         if source not in ("mask", "union"):
             raise BadInput(f"{self.folder}: silhouette source {source!r}: this layout has joined masks only")
-        return self._read("masks", camera, frame, lambda path: read_mask(path, "half"))
+        self.check_index(camera, frame)
+        path = self.picture("masks", camera, frame)
+        return self.read_picture(path, camera, lambda path: read_mask(path, "half"), self.image_hint)
 
     def files_of(self, camera: int, frame: int, source: str) -> tuple[Path, ...]:
         return self.picture("images", camera, frame), self.picture("masks", camera, frame)
-
-    def _read(self, kind: str, camera: int, frame: int, read: Callable[[Path], Picture]) -> Picture:
-        self.check_index(camera, frame)
-        return self.read_picture(self.picture(kind, camera, frame), camera, read, "cameras.pkl lists it")
 
     def picture(self, kind: str, camera: int, frame: int) -> Path:
         """The file of a view in images/ or masks/. Raises `BadInput` for a view that the copy does not list."""

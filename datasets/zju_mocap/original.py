@@ -32,7 +32,7 @@ from ihbench.datasets.reading.stored_numbers import described, numbers
 from ihbench.datasets.reading.subject_folders import SubjectFolders, View, count_files
 from ihbench.errors import BadInput
 from ihbench.files import atomic
-from ihbench.files.pictures import read_mask, read_rgb, size_of, write_picture
+from ihbench.files.pictures import read_mask, size_of, write_picture
 from ihbench.files.safe_pickle import load_npy
 from ihbench.files.spelling import missing_file
 from ihbench.scene.copy_report import SubjectReport
@@ -97,6 +97,7 @@ class ZjuCapture(CaptureFolder):
     layout, prefix = "original", FOLDER_PREFIX
     fits = FITS  # parameter folders, the preferred one first
     silhouettes = tuple(SILHOUETTES)
+    image_hint = "annots.npy lists it"
     mask_kinds: tuple[str, ...] = ("mask", "mask_cihp")
 
     def __init__(self, folder: Path, body: Body | None = None):
@@ -141,17 +142,13 @@ class ZjuCapture(CaptureFolder):
             raise BadInput(f"{path}: NaN or infinite vertices; expected finite metres")
         return vertices.astype(np.float64)
 
-    def image(self, camera: int, frame: int) -> NDArray[np.uint8]:
-        """[H, W, 3] RGB, as stored."""
-        return self.read_picture(self.image_path(camera, frame), camera, read_rgb, "annots.npy lists it")
-
     def silhouette(self, camera: int, frame: int, source: str = "mask") -> NDArray[np.bool_]:
         """[H, W]. `source` is "mask", "mask_cihp" or "union" (either of the two, as HumanNeRF and OccNeRF)."""
         self.check_source(source)
         person = None
         for kind in SILHOUETTES[source]:
             path = self.mask_path(camera, frame, kind)
-            here = self.read_picture(path, camera, lambda path: read_mask(path, "non-zero"), "annots.npy lists it")
+            here = self.read_picture(path, camera, lambda path: read_mask(path, "non-zero"), self.image_hint)
             person = here if person is None else person | here
         assert person is not None
         return person

@@ -79,4 +79,4 @@ def write_frame(folder: Path, image_path: str, image: NDArray[np.uint8], mask: N
     """The picture files of one camera at one frame; `image_path` as annots.npy lists it, with images/ in front."""
     zju_mocap.write_frame(folder, image_path, image)
     path = folder / "mask" / PurePosixPath(image_path).relative_to("images").with_suffix(".png")
-    write_picture(path, mask.astype(np.uint8) * 255)
+    write_picture(path, (mask != 0) * np.uint8(255))
