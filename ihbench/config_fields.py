@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 import types
 import unicodedata
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -72,32 +72,24 @@ class Entries:
 
 
 @dataclass(frozen=True)
-class FolderName:
-    """Texts that may become the name of a folder, such as a subject or a protocol's id."""
+class TextRule:
+    """Texts for which `holds` does; in words."""
 
-    def holds(self, text: str) -> bool:
-        unfit = any(sign in "/\\" or unicodedata.category(sign)[0] == "C" for sign in text)
-        return bool(text.strip()) and len(text) <= LONGEST_NAME and not (unfit or text.startswith("."))
-
-    def __str__(self) -> str:
-        return f"a name of 1 to {LONGEST_NAME} characters, no slash, no dot in front, no control character"
+    words: str
+    holds: Callable[[str], bool]
 
 
-@dataclass(frozen=True)
-class Readable:
-    """Texts for readers."""
-
-    def holds(self, text: str) -> bool:
-        return len(text) <= LONGEST_TEXT
-
-    def __str__(self) -> str:
-        return f"a text of up to {LONGEST_TEXT} characters"
+def _is_folder_name(text: str) -> bool:
+    unfit = any(sign in "/\\" or unicodedata.category(sign)[0] == "C" for sign in text)
+    return bool(text.strip()) and len(text) <= LONGEST_NAME and not (unfit or text.startswith("."))
 
 
+NAME_WORDS = f"a name of 1 to {LONGEST_NAME} characters, no slash, no dot in front, no control character"
+TEXT_WORDS = f"a text of up to {LONGEST_TEXT} characters"
 SEEDS = Within(0, LARGEST_SEED)
 ANY_NUMBER = Within(-(2**63), 2**63 - 1, words="a finite number, below 2^63")
-Name = Annotated[str, FolderName()]
-Text = Annotated[str, Readable()]
+Name = Annotated[str, TextRule(NAME_WORDS, _is_folder_name)]  # may become a folder: a subject, a protocol's id
+Text = Annotated[str, TextRule(TEXT_WORDS, lambda text: len(text) <= LONGEST_TEXT)]
 
 
 def whole(text: str) -> int:
@@ -313,10 +305,10 @@ def read(hint: Any, value: Any, where: str, key: str = "", strict: bool = True) 
         kinds = parts[:1] * len(value) if free else parts
         entries = enumerate(zip(kinds, value, strict=True), 1)
         return tuple(read(kind, item, where, f"{key}, entry {k}", strict) for k, (kind, item) in entries)
-    words: list[Any] = [word for word in extras if isinstance(word, FolderName | Readable)]
+    words: list[Any] = [word for word in extras if isinstance(word, TextRule)]
     bounds: list[Any] = [] if isinstance(value, bool | str) else [*rules(hint)]
     if not (fits(value, hint) and all(rule.holds(value) for rule in bounds + words)):
-        raise BadInput(f"{at}: expected {words[0] if words else expected(hint)}, found {_shown(value)}")
+        raise BadInput(f"{at}: expected {words[0].words if words else expected(hint)}, found {_shown(value)}")
     return value
 
 

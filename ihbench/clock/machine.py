@@ -9,6 +9,7 @@ import os
 import platform
 import sys
 import warnings
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -73,13 +74,17 @@ def load_average() -> tuple[float, ...] | None:
 
 def cpu_model() -> str:
     """The processor's name, as the system tells it."""
-    try:
-        for line in Path("/proc/cpuinfo").read_text(errors="replace").splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()
+    return _field_of("/proc/cpuinfo", "model name") or platform.processor() or platform.machine()
+
+
+def _field_of(file: str, field: str) -> str | None:
+    """What stands behind a field's name and a colon in one of the system's files; None where it does not."""
+    with suppress(OSError):
+        for line in Path(file).read_text(errors="replace").splitlines():
+            name, _, value = line.partition(":")
+            if name.strip() == field:
+                return value.strip()
+    return None
 
 
 def usable_cores() -> int:
@@ -127,13 +132,8 @@ def reset_peak_memory() -> bool:
 
 def process_memory_mb(field: str) -> float | None:
     """MiB of a field of /proc/self/status ("VmRSS" now, "VmHWM" at most); None where there is no such file."""
-    try:
-        for line in Path("/proc/self/status").read_text(errors="replace").splitlines():
-            if line.startswith(field + ":"):
-                return int(line.split()[1]) / 2**10
-    except OSError:
-        pass
-    return None
+    size = _field_of("/proc/self/status", field)
+    return None if size is None else int(size.split()[0]) / 2**10
 
 
 def peak_device_memory_mb() -> float:

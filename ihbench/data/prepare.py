@@ -204,11 +204,21 @@ def _write(
 ) -> None:
     views: list[TrainView] = scene.train  # type: ignore[assignment]
     folder.mkdir(parents=True)
-    cameras, poses, states = [], [], []
-    for view in views:
+    cameras, poses, rows = [], [], []
+    for number, view in enumerate(views):
         cameras.append(view.camera)
         poses.append(view.body_pose)
-        states.append(hashlib.sha256(np.ascontiguousarray(view.mask).tobytes()).hexdigest())
+        rows.append(
+            {
+                "number": number,
+                "frame": view.frame,
+                "camera": view.camera_id,
+                "covered": scene.hiding.covered[number],
+                "camera_sha256": _sha_of(_camera_words(view.camera)),
+                "pose_sha256": _sha_of(_pose_words(view.body_pose)),
+                "mask_sha256": hashlib.sha256(np.ascontiguousarray(view.mask).tobytes()).hexdigest(),
+            }
+        )
 
     def handed() -> Iterator[HandedView]:
         with progress.task(f"handing out {scene.capture.name}", len(views)) as task:
@@ -246,18 +256,7 @@ def _write(
         "masks": f"visible person; {UNKNOWN_FOLDER}/ shows what is hidden: person or background, nobody knows",
         "body_poses": "as the data set ships them, "
         + ("whatever they were fitted to" if scene.hiding.in_scene else "fitted to un-occluded images"),
-        "train": [
-            {
-                "number": number,
-                "frame": scene.hiding.frames[number],
-                "camera": views[number].camera_id,
-                "covered": scene.hiding.covered[number],
-                "camera_sha256": _sha_of(_camera_words(cameras[number])),
-                "pose_sha256": _sha_of(_pose_words(poses[number])),
-                "mask_sha256": states[number],
-            }
-            for number in range(len(views))
-        ],
+        "train": rows,
         "test": TEST_VIEWS,
         "files": {
             path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
@@ -273,11 +272,9 @@ def _test_views(scene: OccludedScene, body: Body) -> Iterator[dict[str, Any]]:
     from ihbench.body import zju_root
     from ihbench.scene.views import straight_camera
 
-    lenses: dict[int, Camera] = {}
     for key in scene.test_keys:
-        if key.camera not in lenses:
-            lenses[key.camera] = straight_camera(scene.capture.camera(key.camera), scene.protocol.image)
-        camera, pose = lenses[key.camera], scene.capture.body_pose(key.frame)
+        camera = straight_camera(scene.capture.camera(key.camera), scene.protocol.image)
+        pose = scene.capture.body_pose(key.frame)
         Rh, Th = zju_root(pose, body)
         yield {
             "prediction": f"{scene.capture.name}/{key.name}.png",

@@ -22,7 +22,7 @@ from ihbench.scene.occlusion import OcclusionPlan, withheld
 from ihbench.scene.protocol import Protocol
 from ihbench.scene.spread import spread
 from ihbench.scene.views import OccludedScene
-from ihbench.scene.visibility import Visibility, texel_visibility
+from ihbench.scene.visibility import texel_visibility
 
 MEASURE_SIZE = 256  # px; visibility is measured on images reduced to about this
 MEASURE_VIEWS = 50  # at most this many training views, evenly spaced
@@ -99,9 +99,9 @@ def measure_scene(scene: OccludedScene) -> SceneMeasure:
         covered_views=0 if hiding.occlusion.hides_nothing else sum(hiding.covered),
         test_views=len(protocol.test_views(capture.name, capture.n_frames, len(capture.camera_ids))),
         hidden_share=hiding.hidden_share([frames[k] for k in chosen]),
-        visible_texels=_share(seen, "visible"),
-        hidden_texels=_share(seen, "hidden"),
-        never_seen_texels=_share(seen, "never_seen"),
+        visible_texels=float(seen.visible.mean()),
+        hidden_texels=float(seen.hidden.mean()),
+        never_seen_texels=float(seen.never_seen.mean()),
         motion_deg=_motion(poses[:, 1:]),
         turn_deg=_turn(poses[:, 0]),
         pixel_mm=1000 * depth / focal,
@@ -123,10 +123,6 @@ def absent_regions(measure: SceneMeasure, regions: tuple[str, ...]) -> list[Omis
         *(Omission(region, None, reason) for region, reason in unknowable.items()),
         *(Omission(r, None, reasons[r]) for r in regions if r in shares and shares[r] == 0),
     ]
-
-
-def _share(seen: Visibility, what: str) -> float:
-    return float(getattr(seen, what).mean())
 
 
 def _mask_view(capture: Capture, protocol: Protocol, hiding: OcclusionPlan, k: int) -> _MaskView:

@@ -91,15 +91,13 @@ def _raw_traits(scorer: Scorer, keys: Sequence[TestViewKey]) -> NDArray[np.float
     """[N, 7] of some test views: the camera's direction (3), the frame, the shares of what is shown that are hidden
     and never seen, and the logarithm of the person's size."""
     scene, body = scorer.scene, scorer.surface.body
-    cameras, poses = {}, {}
-    rows = []
+    poses, rows = {}, []
     for key in keys:
-        if key.camera not in cameras:
-            cameras[key.camera] = straight_camera(scene.capture.camera(key.camera), scene.protocol.image)
+        camera = straight_camera(scene.capture.camera(key.camera), scene.protocol.image)
         if key.frame not in poses:
             pose = scene.capture.body_pose(key.frame)
             poses[key.frame] = body.pose(pose), axis_angle_to_matrix(pose.pose[0]), body.posed_joints(pose)[0]
-        camera, (vertices, root, centre) = cameras[key.camera], poses[key.frame]
+        vertices, root, centre = poses[key.frame]
         away = camera.center - centre
         direction = away @ root / max(np.linalg.norm(away), 1e-9)  # in the person's own axes
         scale = SIDE / max(camera.width, camera.height)
