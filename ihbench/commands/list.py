@@ -31,7 +31,7 @@ class ListOptions(Printing):
 def main(argv: list[str]) -> int:
     chosen = options(ListOptions, argv, "list", "What is registered, one line each.")
     kinds = KINDS if chosen.kind == "all" else (chosen.kind,)
-    found = {kind: _DESCRIBE[kind]() for kind in kinds}
+    found = {kind: _described(kind) for kind in kinds}
     if chosen.kind == "all":
         found |= _clashes()
     blocks: list[Block] = []
@@ -41,21 +41,19 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def _methods() -> dict[str, str]:
-    return _each("method", lambda name: (name, method_spec(name).summary))
-
-
-def _datasets() -> dict[str, str]:
+def _described(kind: str) -> dict[str, str]:
+    """Name -> what it is, of everything of a kind."""
     standins = registry.names("stand-in")
-    return _each("dataset", lambda name: (name, "with a stand-in" if name in standins else ""))
-
-
-def _protocols() -> dict[str, str]:
-    return _each("protocol", lambda name: ((p := load_protocol(name)).name, p.title))
-
-
-def _reports() -> dict[str, str]:
-    return _each("report", lambda name: (name, ""))
+    match kind:
+        case "methods":
+            return _each("method", lambda name: (name, method_spec(name).summary))
+        case "datasets":
+            return _each("dataset", lambda name: (name, "with a stand-in" if name in standins else ""))
+        case "protocols":
+            return _each("protocol", lambda name: ((p := load_protocol(name)).name, p.title))
+        case "reports":
+            return _each("report", lambda name: (name, ""))
+    return _metrics()
 
 
 def _each(kind: str, describe: Callable[[str], tuple[str, str]]) -> dict[str, str]:
@@ -94,12 +92,3 @@ def _metrics() -> dict[str, str]:
             identity = str(measure.identity("REGION", (1.0, 1.0, 1.0)))
             found[identity] = measure.about + regions
     return found
-
-
-_DESCRIBE = {
-    "methods": _methods,
-    "datasets": _datasets,
-    "protocols": _protocols,
-    "reports": _reports,
-    "metrics": _metrics,
-}

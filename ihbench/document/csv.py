@@ -49,11 +49,17 @@ def _sentences(blocks: Sequence[Block]) -> Iterator[tuple[str, str]]:
 def write_cells(about: Mapping[str, str], tables: Sequence[Table], footnotes: Mapping[str, str]) -> str:
     """One line for each number of the tables: `about` all of them, its row and column, and what it is worth. Absent
     numbers are empty; footnotes are in words."""
-    rows = [{**about, **cell} for table in tables for cell in _cells(table, footnotes)]
+    return write_rows([{**about, **cell} for table in tables for cell in _cells(table, footnotes)], [*about])
+
+
+def write_rows(rows: Sequence[Mapping[str, Any]], first: Sequence[str] = ()) -> str:
+    """Rows with the columns of all of them, in order, behind the `first` ones; numbers to the last bit, an absent one
+    is an empty cell."""
     out = io.StringIO()
-    lines = csv.DictWriter(out, list(rows[0]) if rows else [*about], lineterminator="\n")
+    names = dict.fromkeys([*first, *(name for row in rows for name in row)])
+    lines = csv.DictWriter(out, list(names), lineterminator="\n")
     lines.writeheader()
-    lines.writerows({key: harmless(_csv_value(value)) for key, value in row.items()} for row in rows)
+    lines.writerows({key: _value(value) for key, value in row.items()} for row in rows)
     return out.getvalue()
 
 
@@ -117,10 +123,10 @@ def _number(number: Number, footnotes: Mapping[str, str]) -> dict[str, Any]:
     }
 
 
-def _csv_value(value: Any) -> Any:
+def _value(value: Any) -> Any:
     if isinstance(value, float):
         return "" if math.isnan(value) else repr(value)
-    return " | ".join(value) if isinstance(value, list) else value
+    return harmless(" | ".join(value) if isinstance(value, list) else value)
 
 
 def harmless(value: Any) -> Any:

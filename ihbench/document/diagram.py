@@ -6,7 +6,6 @@ A diagram is written three times under one name: `.png` to look at, `.svg` to pr
 
 from __future__ import annotations
 
-import csv
 import io
 import itertools
 import math
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ihbench.document.csv import harmless
+from ihbench.document.csv import write_rows
 from ihbench.errors import visible
 
 if TYPE_CHECKING:
@@ -45,6 +44,10 @@ STYLE: Any = {  # as matplotlib names them
 DPI = 150
 TICKS_1 = (1, 2, 3, 4, 5, 6, 7, 8, 9)
 APART = 7.0  # px between a label and a point
+PLACES = (  # of a label around its point: distances and widths to the right, distances and heights up
+    (1, 0, 0, -0.5), (-1, -1, 0, -0.5), (0, -0.5, 1, 0), (0, -0.5, -1, -1),
+    (0.7, 0, 0.7, 0), (0.7, 0, -0.7, -1), (-0.7, -1, 0.7, 0), (-0.7, -1, -0.7, -1),
+)  # fmt: skip
 LETTER = 0.6  # mean width of a letter over the font's size
 
 
@@ -73,7 +76,7 @@ def files(drawn: Figure, rows: Sequence[Mapping[str, Any]]) -> dict[str, bytes]:
             # an SVG would carry the date, and never be the same file twice
             drawn.savefig(memory, format=kind, dpi=DPI, metadata={"Date": None} if kind == "svg" else None)
             content[f".{kind}"] = memory.getvalue()
-    return content | {".csv": csv_text(rows).encode()}
+    return content | {".csv": write_rows(rows).encode()}
 
 
 def words(text: str) -> str:
@@ -87,23 +90,6 @@ def settle(drawn: Figure) -> None:
     if engine is not None:
         engine.execute(drawn)
         drawn.set_layout_engine("none")
-
-
-def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Rows with the columns of all of them, in order; numbers to the last bit, an absent one is an empty cell."""
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(names)
-    for row in rows:
-        writer.writerow([_cell(row.get(name)) for name in names])
-    return text.getvalue()
-
-
-def _cell(value: Any) -> Any:
-    if value is None or (isinstance(value, float) and math.isnan(value)):
-        return ""
-    return repr(value) if isinstance(value, float) else harmless(value)
 
 
 def logarithmic(axes: Axes, x: Sequence[float], y: Sequence[float]) -> None:
@@ -225,18 +211,8 @@ def place_labels(
 
 def _offsets(width: float, height: float) -> list[tuple[float, float, bool]]:
     """Lower left corners of a label relative to its point in pixels, nearest first, and whether it needs a line."""
-    found = []
-    for distance in (9.0, 18.0, 30.0, 45.0, 64.0):
-        far = distance > 18.0
-        d = distance
-        found += [
-            (d, -height / 2, far),
-            (-d - width, -height / 2, far),
-            (-width / 2, d, far),
-            (-width / 2, -d - height, far),
-            (d * 0.7, d * 0.7, far),
-            (d * 0.7, -d * 0.7 - height, far),
-            (-d * 0.7 - width, d * 0.7, far),
-            (-d * 0.7 - width, -d * 0.7 - height, far),
-        ]
-    return found
+    return [
+        (x * far + across * width, y * far + up * height, far > 18.0)
+        for far in (9.0, 18.0, 30.0, 45.0, 64.0)
+        for x, across, y, up in PLACES
+    ]

@@ -83,7 +83,6 @@ def _block(block: Block, folder: Path) -> str:
                 r"\begin{center}" + rf"\includegraphics[width=\linewidth]{{\detokenize{{{where}}}}}"
                 rf"\\ {escape(caption)}" + r"\end{center}"
             )
-    raise TypeError(f"report: expected a block of document.py, got {type(block).__name__}")
 
 
 def _environment(table: Table) -> str:

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ihbench.document import diagram
+from ihbench.document.csv import write_rows
 from ihbench.document.diagram import Label, place_labels, round_ticks, tick_text
 from ihbench.record import outputs
 
@@ -77,7 +78,7 @@ def test_three_files_and_the_same_picture_is_the_same_file(tmp_path):
 
 def test_a_csv_keeps_every_bit_and_no_spreadsheet_takes_a_name_for_a_formula(tmp_path):
     rows = [{"name": "=cmd|' /C calc'!A0", "x": 0.1 + 0.2}, {"x": math.nan, "more": 'a,b\n"c"'}]
-    (tmp_path / "t.csv").write_text(diagram.csv_text(rows))
+    (tmp_path / "t.csv").write_text(write_rows(rows))
     first, second = csv.DictReader((tmp_path / "t.csv").open(newline=""))
     assert first["name"].startswith("'=")
     assert float(first["x"]) == 0.1 + 0.2
