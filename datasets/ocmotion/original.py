@@ -194,9 +194,7 @@ class OcMotionCapture(OneCameraCapture):
         self._masks = tuple(root / mask_file(path, track.suffix) for path in paths)
         self._annotated_size = _one_size(track)
         self._people = [(_person(frame, track.person, where), where) for frame, where in track.frames]
-        K = np.stack([numbers(person, "intri", (3, 3), where) for person, where in self._people])
-        E = np.stack([numbers(person, "extri", (4, 4), where) for person, where in self._people])
-        self._K, self._E = one_camera(K, E, [where for _, where in self._people])
+        self._K, self._E = one_camera(self._people, "intri", "extri")
 
     def body_pose(self, frame: int) -> BodyPose:
         """The frame's SMPL parameters: standard root, world, metres."""
@@ -340,9 +338,15 @@ def metric_pose(pose: Array, betas: Array, trans: Array, where: str) -> BodyPose
     return BodyPose(pose, betas, trans)
 
 
-def one_camera(K: Array, E: Array, where: Sequence[str]) -> tuple[Array, Array]:
-    """The first of K [N, 3, 3] and E [N, 4, 4], checked, when all frames have that camera. Raises `BadInput`."""
-    check_calibration(K[0], E[0], where[0])
+def one_camera(
+    entries: Sequence[tuple[Mapping, str]],  # of the frames, with their places
+    intrinsics: str,
+    extrinsics: str,
+) -> tuple[Array, Array]:
+    """K [3, 3] and E [4, 4] under these keys, checked, when all frames have that camera. Raises `BadInput`."""
+    K = np.stack([numbers(entry, intrinsics, (3, 3), where) for entry, where in entries])
+    E = np.stack([numbers(entry, extrinsics, (4, 4), where) for entry, where in entries])
+    check_calibration(K[0], E[0], entries[0][1])
     differences = np.zeros(len(K))
     for value in (K, E[:, :3, :3], E[:, :3, 3], E[:, 3]):
         value = value.reshape(len(K), -1)
@@ -351,7 +355,7 @@ def one_camera(K: Array, E: Array, where: Sequence[str]) -> tuple[Array, Array]:
     other = int(differences.argmax())
     if differences[other] > SAME_CAMERA:
         raise BadInput(
-            f"{where[other]}: its camera differs from the first frame's by {differences[other]:.2g} (relative); "
+            f"{entries[other][1]}: its camera differs from the first frame's by {differences[other]:.2g} (relative); "
             f"expected one fixed camera for all frames"
         )
     return K[0], E[0]

@@ -109,11 +109,8 @@ class W2aCapture(OneCameraCapture):
         self.camera_ids = (camera_id(folder.name),)
         self._images = tuple(files.get(name, folder / "images" / f"{name}.png") for name in self.frame_names)
         self._masks = tuple(folder / "masks" / f"{name}.png" for name in self.frame_names)
-        where = [self._where(name) for name in self.frame_names]
-        entries = [self._metadata[name] for name in self.frame_names]
-        K = np.stack([numbers(entry, "cam_intrinsics", (3, 3), at) for entry, at in zip(entries, where, strict=True)])
-        E = np.stack([numbers(entry, "cam_extrinsics", (4, 4), at) for entry, at in zip(entries, where, strict=True)])
-        self._K, self._E = one_camera(K, E, where)
+        entries = [(self._metadata[name], self._where(name)) for name in self.frame_names]
+        self._K, self._E = one_camera(entries, "cam_intrinsics", "cam_extrinsics")
 
     def body_pose(self, frame: int) -> BodyPose:
         """The frame's SMPL parameters: standard root (of mesh_infos.pkl, when it is there), world, metres."""

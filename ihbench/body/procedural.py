@@ -91,25 +91,21 @@ def skinning_weights(vertices: Array) -> Array:
 
 
 def _one_sided_weights(vertices: Array) -> Array:
-    J = rest_joints()
+    height = dict(zip(JOINT_NAMES, rest_joints()[:, 1], strict=True))
     x, y, z = vertices.T
-
-    def height(name: str) -> float:
-        return J[JOINT_INDEX[name], 1]
-
     spine = chain(
         ("pelvis", "spine1", "spine2", "spine3"),
         (
-            ramp(y, height("spine1") - 0.07, height("spine1") + 0.05),
-            ramp(y, height("spine2") - 0.05, height("spine2") + 0.05),
-            ramp(y, height("spine3") - 0.05, height("spine3") + 0.05),
+            ramp(y, height["spine1"] - 0.07, height["spine1"] + 0.05),
+            ramp(y, height["spine2"] - 0.05, height["spine2"] + 0.05),
+            ramp(y, height["spine3"] - 0.05, height["spine3"] + 0.05),
         ),
     )
     neck = chain(
         ("spine3", "neck", "head"),
         (
-            ramp(y, height("neck") - 0.05, height("neck") + 0.025),
-            ramp(y, height("head") - 0.035, height("head") + 0.03),
+            ramp(y, height["neck"] - 0.05, height["neck"] + 0.025),
+            ramp(y, height["head"] - 0.035, height["head"] + 0.03),
         ),
     )
     out = blend(spine, neck, ramp(y, 0.44, 0.50) * ramp(np.abs(x), 0.13, 0.05))
@@ -130,13 +126,13 @@ def _one_sided_weights(vertices: Array) -> Array:
         leg = chain(
             (f"{side}_hip", f"{side}_knee", f"{side}_ankle", f"{side}_foot"),
             (
-                ramp(height(f"{side}_knee") - y, -0.065, 0.065),
-                ramp(height(f"{side}_ankle") - y, -0.045, 0.03),
+                ramp(height[f"{side}_knee"] - y, -0.065, 0.065),
+                ramp(height[f"{side}_ankle"] - y, -0.045, 0.03),
                 ramp(z, 0.045, 0.10) * ramp(-y, 0.88, 0.90),
             ),
         )
         # the hip plane runs from the crotch up to the iliac crest
-        below_hip = height(f"{side}_hip") - y + 0.55 * (outward - 0.092)
+        below_hip = height[f"{side}_hip"] - y + 0.55 * (outward - 0.092)
         out = blend(out, leg, ramp(below_hip, -0.075, 0.085) * ramp(outward, -0.012, 0.03))
     return out / out.sum(1, keepdims=True)
 
