@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -13,6 +13,10 @@ from ihbench.commands.options.parse import options
 from ihbench.config_fields import WHOLE, whole
 from ihbench.errors import BadInput
 from ihbench.version import __version__
+
+if TYPE_CHECKING:
+    from ihbench.record.finished_run import FinishedRun
+    from ihbench.record.schema import RunRecord
 
 
 @dataclass(frozen=True)
@@ -40,13 +44,15 @@ def main(argv: list[str]) -> int:
     from ihbench.files.atomic import is_stream
     from ihbench.files.splat_ply import UPRIGHT, VIEWER_TURN, write_splat_ply
     from ihbench.record import outputs
+    from ihbench.record.finished_run import FinishedRun
     from ihbench.runner.run_loop import load_avatar
 
     outputs.check_file(chosen.out, chosen.data, chosen.body)
-    avatar, open_capture = load_avatar(chosen.run, chosen.data, chosen.body)
+    run = FinishedRun(chosen.run, chosen.data, chosen.body)
+    avatar = load_avatar(run)
     if not hasattr(avatar, "gaussians"):
         raise BadInput(f"{chosen.run}: its method has no Gaussians to export")
-    pose = _pose(chosen.pose, avatar, open_capture)
+    pose = _pose(chosen.pose, avatar, run)
     means, scales, colors = (values.detach().cpu().numpy() for values in avatar.gaussians(pose))
     finite = np.isfinite(np.column_stack([means, scales, colors])).all(1)
     if not finite.all():  # the renderer does not draw them either
@@ -54,50 +60,46 @@ def main(argv: list[str]) -> int:
         means, scales, colors = means[finite], scales[finite], colors[finite]
     rotation = UPRIGHT
     if chosen.axes == "viewer":
-        means, rotation = _for_viewers(means, pose, avatar, chosen), VIEWER_TURN
+        means, rotation = _for_viewers(means, pose, avatar, run), VIEWER_TURN
     out = chosen.out or chosen.run / "avatar.ply"
-    write_splat_ply(out, means, scales, colors, _comments(chosen), rotation)
+    write_splat_ply(out, means, scales, colors, _comments(chosen, run.record), rotation)
     said = sys.stderr if is_stream(out) else sys.stdout  # which may be the file itself
     print(f"{len(means)} Gaussians in pose {chosen.pose} written to {out}", file=said)
     return 0
 
 
-def _pose(name: str, avatar: Any, open_capture: Any) -> Any:
+def _pose(name: str, avatar: Any, run: FinishedRun) -> Any:
     import numpy as np
 
     from ihbench.body.canonical import canonical_pose
     from ihbench.body.pose import BodyPose
 
     if WHOLE.fullmatch(name):
-        return open_capture().body_pose(whole(name))
+        return run.capture.body_pose(whole(name))
     return BodyPose(canonical_pose(name), avatar.betas, np.zeros(3))
 
 
-def _for_viewers(means: Any, pose: Any, avatar: Any, chosen: ExportOptions) -> Any:
+def _for_viewers(means: Any, pose: Any, avatar: Any, run: FinishedRun) -> Any:
     """[N, 3] m, upright about the pelvis of the avatar's own body."""
     from ihbench.body.pose import BodyPose
     from ihbench.body.skinning_numpy import axis_angle_to_matrix
     from ihbench.files.splat_ply import in_viewer_axes
-    from ihbench.record.reopen import reopen_body
 
-    body = getattr(avatar, "body", None) or reopen_body(chosen.run, chosen.data, chosen.body)
+    body = getattr(avatar, "body", None) or run.body
     pelvis = body.posed_joints(BodyPose(pose.pose, avatar.betas, pose.transl))[0]
     return in_viewer_axes(means, pelvis, axis_angle_to_matrix(pose.pose[0]))
 
 
-def _comments(chosen: ExportOptions) -> list[str]:
+def _comments(chosen: ExportOptions, record: RunRecord) -> list[str]:
     """What the file says of itself. Brush and splat-transform read the last."""
-    from ihbench.record.store import RunFolder
-
-    folder = RunFolder.open(chosen.run)
-    identity = folder.identity
+    identity = record.identity
     axes = {
         "viewer": "y down, z forward (180 degrees about z from y-up); the pelvis at the origin",
         "world": "those of the data set",
     }[chosen.axes]
     return [
         f"Exported from ihbench {__version__}",
-        f"run: {folder.record.digest} {identity.method} {identity.scene}",
+        f"run: {record.digest} {identity.method} {identity.scene}",
         f"pose: {chosen.pose}",
         "units: metres",
         f"axes: {axes}",

@@ -34,7 +34,7 @@ class PlanOptions(SceneChoice, Printing):
 
 def _planned(chosen: SceneChoice, protocol: Protocol) -> dict[str, Any]:
     from ihbench.clock.machine import cpu_model
-    from ihbench.record.earlier_runs import earlier_runs
+    from ihbench.record.finished_run import earlier_runs
     from ihbench.record.source_digest import code_of
     from ihbench.runner.run_loop import configuration
     from ihbench.scene.data_source import locate, open_capture

@@ -34,7 +34,7 @@ BENCH = Path(__file__).resolve().parents[1]
 NOT_IN_NUMBERS = (
     *(f"{room}/*" for room in registry.ROOMS),
     "commands/*", "kernels/*", "stress/*", "__main__.py", "cli.py", "clock/progress.py", "errors.py", "registry.py",
-    "runner/ablation.py", "runner/executor.py", "record/earlier_runs.py", "record/index.py", "record/quality_time.py",
+    "runner/ablation.py", "runner/executor.py", "record/index.py", "record/quality_time.py",
     "record/frame.py", "record/scene_means.py", "record/row_choice.py", "record/row_labels.py",
     "scoring/contact_sheet.py", "document/*", "files/splat_ply.py",
     "api.py", "runner/repeat.py", "clock/gpu_slots.py", "clock/failures.py", "clock/streams.py",

@@ -8,9 +8,8 @@ from typing import Any
 
 from ihbench.config_fields import flat, with_fields
 from ihbench.errors import BadInput
-from ihbench.record.reopen import reopen_protocol
+from ihbench.record.finished_run import FinishedRun
 from ihbench.record.results import RunResult, read_result
-from ihbench.record.store import RunFolder
 from ihbench.runner.run_loop import RunRequest, configuration
 
 
@@ -27,9 +26,9 @@ def repetition(folder: Path, runs: Path, body: Path | None, device: str, force: 
 
     Raises `BadInput` for a folder that holds no run, scored predictions, and a method with other switches by now.
     """
-    run = RunFolder.open(folder)
-    identity = run.identity
-    if run.about.predictions is not None:
+    run = FinishedRun(folder)
+    identity = run.record.identity
+    if run.record.about.predictions is not None:
         raise BadInput(f"{folder}: holds scored images, not a run of a method; repeat it with ihbench score")
     method, switches = identity.method, identity.switches
     config = configuration(method, identity.profile, {})
@@ -40,7 +39,7 @@ def repetition(folder: Path, runs: Path, body: Path | None, device: str, force: 
             f"its code was {identity.code}"
         )
     config, keep = with_fields(config, switches), tuple(identity.config.get("keep", ()))
-    request = RunRequest(reopen_protocol(folder), method, config, identity.seed, device, runs, body, force, keep)
+    request = RunRequest(run.protocol, method, config, identity.seed, device, runs, body, force, keep)
     return Repetition(request, identity.scene)
 
 

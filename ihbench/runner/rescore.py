@@ -17,7 +17,7 @@ from ihbench.files import atomic
 from ihbench.files.images import read_image
 from ihbench.files.shape import as_json
 from ihbench.metrics.evaluate import Preset, find_preset
-from ihbench.record.reopen import reopen_protocol, reopen_scene
+from ihbench.record.finished_run import FinishedRun
 from ihbench.record.results import view_rows
 from ihbench.record.schema import PresetHead, preset_lines
 from ihbench.record.source_digest import bench_code
@@ -33,14 +33,14 @@ def rescore(folder: Path, preset: str, data: Path | None, body: Path | None, pro
     now. Raises `BadInput` for an unknown preset, a run that is not done, and data that are not the run's.
     """
     chosen = find_preset(preset)
-    run = RunFolder.open(folder)
+    run, made_on = RunFolder.open(folder), FinishedRun(folder, data, body)
     if run.status != "done":
         raise BadInput(f"{folder}: is {run.status}, only finished runs have renders to score")
     file = folder / "presets" / f"{chosen.name}.jsonl"
-    code = bench_code(reopen_protocol(folder), (chosen.name,))
+    code = bench_code(made_on.protocol, (chosen.name,))
     if file.is_file() and _stands(file, chosen, code):
         return
-    scene, _ = reopen_scene(folder, data, body)
+    scene = made_on.scene
     scorer = Scorer.build(scene, [chosen.name])
     name = run.identity.method
     rows = {name: lambda loaded: _render(run, loaded)}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from dataclasses import field as dataclass_field
 from functools import cached_property
@@ -25,8 +25,8 @@ from ihbench.clock.progress import Progress
 from ihbench.config_fields import SEEDS, flat, with_fields
 from ihbench.errors import BadInput
 from ihbench.metrics import Identity, mean_over_frames
+from ihbench.record.finished_run import FinishedRun
 from ihbench.record.provenance import command
-from ihbench.record.reopen import reopen_body, reopen_capture
 from ihbench.record.results import RunResult
 from ihbench.record.schema import CurvePoint, RunIdentity
 from ihbench.record.source_digest import code_of, shipped_digest
@@ -118,14 +118,13 @@ def run_identity(request: RunRequest, capture: Capture, body: Body) -> RunIdenti
     return identity_of(request.protocol, capture, body, request.method, config, request.seed, code)
 
 
-def load_avatar(folder: Path, data: Path | None, body: Path | None) -> tuple[Any, Callable[[], Capture]]:
-    """The avatar of a run, and a function that opens the run's capture for its poses."""
-    run = RunFolder.open(folder)
-    if not (folder / "avatar").is_dir():
-        raise BadInput(f"{folder}: has no avatar (status {run.status}); finish the run first")
-    spec, model = method_spec(run.identity.method), reopen_body(folder, data, body)
-    method = spec.create(spec.profile(run.identity.profile))
-    return method.load(folder / "avatar", model), lambda: reopen_capture(folder, data, body)
+def load_avatar(run: FinishedRun) -> Any:
+    """The avatar of a run. Raises `BadInput` where it has none."""
+    if not (run.folder / "avatar").is_dir():
+        raise BadInput(f"{run.folder}: has no avatar (status {run.record.outcome.status}); finish the run first")
+    identity = run.record.identity
+    spec = method_spec(identity.method)
+    return spec.create(spec.profile(identity.profile)).load(run.folder / "avatar", run.body)
 
 
 class _Run(RecordedRun):

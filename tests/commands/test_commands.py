@@ -16,6 +16,7 @@ from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.files.atomic import read_json, read_json_lines
 from ihbench.files.splat_ply import read_splat_ply
 from ihbench.metrics import Identity
+from ihbench.record.finished_run import FinishedRun
 from ihbench.record.results import read_result
 from ihbench.runner.run_loop import load_avatar
 from ihbench.scene.data_source import standin_root
@@ -186,12 +187,10 @@ def test_export_writes_the_avatars_gaussians_in_the_pose_asked_for(bench_with_ru
     assert outcome.status == 0, outcome.err
     means, scales, colors = read_splat_ply(out.read_bytes())
     with bench_with_run.in_its_world():
-        avatar, open_capture = load_avatar(folder, None, None)
-        body_pose = (
-            open_capture().body_pose(120)
-            if pose == "120"
-            else BodyPose(canonical_pose("a_pose"), avatar.betas, np.zeros(3))
-        )
+        run = FinishedRun(folder)
+        avatar = load_avatar(run)
+        named = BodyPose(canonical_pose("a_pose"), avatar.betas, np.zeros(3))
+        body_pose = run.capture.body_pose(120) if pose == "120" else named
         expected = [value.numpy() for value in avatar.gaussians(body_pose)]
     assert len(means) == len(avatar) > 100
     np.testing.assert_array_equal(means, expected[0])

@@ -20,9 +20,8 @@ from ihbench.clock.ledger import Ledger
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.shape import as_json
-from ihbench.record.earlier_runs import earlier_runs
+from ihbench.record.finished_run import FinishedRun, earlier_runs
 from ihbench.record.index import Index
-from ihbench.record.reopen import reopen_body, reopen_capture, reopen_protocol
 from ihbench.record.results import read_result
 from ihbench.record.schema import CurvePoint, PredictionFiles, PresetHead, ScoreLine
 from ihbench.record.store import RunFolder
@@ -302,7 +301,7 @@ READERS: dict[str, Callable[[Path, Path, Path], Any]] = {
     "ablation": _ablation,
     "borrow": _borrow,
     "go on": _go_on,
-    "protocol": lambda runs, good, victim: reopen_protocol(victim),
-    "body": lambda runs, good, victim: reopen_body(victim, None, None),
-    "capture": lambda runs, good, victim: reopen_capture(victim, runs, None),
+    "protocol": lambda runs, good, victim: FinishedRun(victim).protocol,
+    "body": lambda runs, good, victim: FinishedRun(victim).body,
+    "capture": lambda runs, good, victim: FinishedRun(victim, runs).capture,
 }

@@ -21,7 +21,7 @@ from ihbench.methods.inpainthuman.config import (
     RESIDUAL_SHARE,
     leave_out,
 )
-from ihbench.record.earlier_runs import earlier_runs
+from ihbench.record.finished_run import earlier_runs
 from ihbench.scene import plan
 from ihbench.scene.plan import (
     TEXELS,

@@ -26,7 +26,7 @@ from ihbench.methods.inpainthuman.stages.stage2 import STATE as PAINTED_STATE
 from ihbench.methods.inpainthuman.stages.stage2 import Stage2
 from ihbench.methods.inpainthuman.stages.stage3 import Stage3
 from ihbench.metrics import Identity, mean_over_frames
-from ihbench.record.reopen import reopen_scene
+from ihbench.record.finished_run import FinishedRun
 from ihbench.record.results import read_result
 from ihbench.scene.contracts import MaskState, TrainView
 from ihbench.scene.views import OccludedScene, uncovered
@@ -60,7 +60,8 @@ def ceiling(
     missing = [state for state in STATES if not state_file(folder, state).is_file()]
     if missing:
         raise BadInput(f"{folder}: has no saved state {missing[0]}; only runs that paint have a ceiling of painting")
-    scene, model = reopen_scene(folder, data, body)
+    run = FinishedRun(folder, data, body)
+    scene, model = run.scene, run.body
     whole = uncovered(scene).train
     fitted = GaussianAvatar.load(folder / "avatar", model)
     seed = result.seed
