@@ -12,8 +12,8 @@ import hashlib
 import json
 import os
 import secrets
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from glob import escape
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from ihbench.camera import Camera
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.files import atomic, locks, removal
+from ihbench.files.shape import as_json, fault, from_json
 from ihbench.scene.contracts import MaskState, TrainView
 from ihbench.scene.views import OccludedScene
 from ihbench.version import __version__
@@ -69,6 +70,56 @@ class Handout:
     body: Body
 
 
+@dataclass(frozen=True)
+class ManifestView:
+    """What the manifest says of a training view."""
+
+    number: int
+    frame: int
+    camera: str
+    covered: bool
+    camera_sha256: str
+    pose_sha256: str
+    mask_sha256: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Manifest:
+    """manifest.json: what a folder holds, and everything that decides which numbers drawings of it get."""
+
+    made_by: str
+    protocol: str  # with version and changes
+    protocol_digest: str
+    profile: str
+    content: Mapping[str, Any] = field(default_factory=dict)  # the protocol's
+    dataset: str
+    variant: str
+    standin: str  # "" for real data
+    scene: str
+    layout: str
+    body: str  # hash of the body model
+    data: str | None  # where the user's copy lies and their body file, as seen from the folder
+    body_file: str | None
+    occlusion: Mapping[str, Any]  # its rule, and what that has drawn
+    masks: str  # what they show
+    body_poses: str  # what they were fitted to
+    train: tuple[ManifestView, ...]
+    test: str  # file of the test views
+    files: Mapping[str, str]  # path in the folder -> SHA-256, of all but the manifest
+
+
+def read_manifest(path: Path) -> Manifest:
+    """Raises `BadInput` for a file that `prepare` has not written."""
+    content = atomic.read_json(path)
+    wrong = fault(content, Manifest)
+    if wrong or not content["made_by"].startswith("ihbench "):
+        raise BadInput(
+            f"{path}: is no manifest of `ihbench prepare` ({wrong or 'another maker'}); name the folder that it has "
+            f"written"
+        )
+    return from_json(content, Manifest)
+
+
 TrainingLayout = Callable[[Handout], Path]  # writes the files and returns the subject's folder
 
 
@@ -97,8 +148,8 @@ def prepare(
     try:
         with locks.locked(lock, "name another folder with --out"):
             _remove_leftovers(out, scene.capture.name)
-            origin = {"data": _from(target, data), "body_file": _from(target, body_file)}
-            _write(scene, body, partial, layout, write, progress, origin)
+            lies = _from(target, data), _from(target, body_file)
+            _write(scene, body, partial, layout, write, progress, *lies)
             if target.exists():
                 check_target(out, scene.capture.name, force, sources)  # again: meanwhile anything may have come there
                 os.rename(target, before)
@@ -170,11 +221,7 @@ def _written_there(folder: Path) -> removal.Ours:
     path = folder / MANIFEST
     if path.is_symlink() or not path.is_file():
         raise BadInput(f"it has no {MANIFEST}")
-    manifest = atomic.read_json(path)
-    files = manifest.get("files") if isinstance(manifest, dict) else None
-    if not isinstance(files, dict) or not str(manifest.get("made_by", "")).startswith("ihbench "):
-        raise BadInput(f"its {MANIFEST} is not one of ours")
-
+    files = read_manifest(path).files
     folders = {parent for file in files for parent in Path(file).parents}
 
     def ours(file: Path) -> bool:
@@ -200,25 +247,18 @@ def _write(
     layout: str,
     write: TrainingLayout,
     progress: Progress,
-    origin: dict[str, str | None],
+    data: str | None,  # as the manifest has them
+    body_file: str | None,
 ) -> None:
     views: list[TrainView] = scene.train  # type: ignore[assignment]
     folder.mkdir(parents=True)
     cameras, poses, rows = [], [], []
-    for number, view in enumerate(views):
+    for k, view in enumerate(views):
         cameras.append(view.camera)
         poses.append(view.body_pose)
-        rows.append(
-            {
-                "number": number,
-                "frame": view.frame,
-                "camera": view.camera_id,
-                "covered": scene.hiding.covered[number],
-                "camera_sha256": _sha_of(_camera_words(view.camera)),
-                "pose_sha256": _sha_of(_pose_words(view.body_pose)),
-                "mask_sha256": hashlib.sha256(np.ascontiguousarray(view.mask).tobytes()).hexdigest(),
-            }
-        )
+        mask_sha = hashlib.sha256(np.ascontiguousarray(view.mask).tobytes()).hexdigest()
+        hashes = _sha_of(_camera_words(view.camera)), _sha_of(_pose_words(view.body_pose)), mask_sha
+        rows.append(ManifestView(k, view.frame, view.camera_id, scene.hiding.covered[k], *hashes))
 
     def handed() -> Iterator[HandedView]:
         with progress.task(f"handing out {scene.capture.name}", len(views)) as task:
@@ -239,35 +279,36 @@ def _write(
         write_png(own / UNKNOWN_FOLDER / f"{number:06d}.png", unknown)
     atomic.write_json(folder / TEST_VIEWS, list(_test_views(scene, body)))
     protocol, capture = scene.protocol, scene.capture
-    manifest = {
-        "made_by": f"ihbench {__version__}",
-        "protocol": protocol.name,
-        "protocol_digest": protocol.digest,
-        "profile": protocol.profile,
-        "content": protocol.content,
-        "dataset": capture.dataset,
-        "variant": capture.variant,
-        "standin": capture.standin,
-        "scene": capture.name,
-        "layout": layout,
-        "body": body.content_sha(),
-        **origin,
-        "occlusion": {"rule": scene.hiding.occlusion.rule, **scene.hiding.occlusion.record},
-        "masks": f"visible person; {UNKNOWN_FOLDER}/ shows what is hidden: person or background, nobody knows",
-        "body_poses": "as the data set ships them, "
-        + ("whatever they were fitted to" if scene.hiding.in_scene else "fitted to un-occluded images"),
-        "train": rows,
-        "test": TEST_VIEWS,
-        "files": {
+    fitted_to = "whatever they were fitted to" if scene.hiding.in_scene else "fitted to un-occluded images"
+    manifest = Manifest(
+        made_by=f"ihbench {__version__}",
+        protocol=protocol.name,
+        protocol_digest=protocol.digest,
+        profile=protocol.profile,
+        content=protocol.content,
+        dataset=capture.dataset,
+        variant=capture.variant,
+        standin=capture.standin,
+        scene=capture.name,
+        layout=layout,
+        body=body.content_sha(),
+        data=data,
+        body_file=body_file,
+        occlusion={"rule": scene.hiding.occlusion.rule, **scene.hiding.occlusion.record},
+        masks=f"visible person; {UNKNOWN_FOLDER}/ shows what is hidden: person or background, nobody knows",
+        body_poses=f"as the data set ships them, {fitted_to}",
+        train=tuple(rows),
+        test=TEST_VIEWS,
+        files={
             path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
             for path in sorted(folder.rglob("*"))
             if path.is_file()
         },
-    }
-    atomic.write_json(folder / MANIFEST, manifest)
+    )
+    atomic.write_json(folder / MANIFEST, as_json(manifest))
 
 
-def _test_views(scene: OccludedScene, body: Body) -> Iterator[dict[str, Any]]:
+def _test_views(scene: OccludedScene, body: Body) -> Iterator[dict[str, object]]:
     """The cameras and poses to draw, and the file names under which `ihbench score` looks for the drawings."""
     from ihbench.body import zju_root
     from ihbench.scene.views import straight_camera
@@ -291,7 +332,7 @@ def _test_views(scene: OccludedScene, body: Body) -> Iterator[dict[str, Any]]:
         }
 
 
-def _camera_words(camera: Camera) -> dict[str, Any]:
+def _camera_words(camera: Camera) -> dict[str, object]:
     """Plain numbers; K with OpenCV's pixel centres at integers."""
     return {
         "K": camera.K_opencv.tolist(),
@@ -302,9 +343,9 @@ def _camera_words(camera: Camera) -> dict[str, Any]:
     }
 
 
-def _pose_words(pose: BodyPose) -> dict[str, Any]:
+def _pose_words(pose: BodyPose) -> dict[str, object]:
     return {"pose": pose.pose.tolist(), "betas": pose.betas.tolist(), "transl": pose.transl.tolist()}
 
 
-def _sha_of(words: dict[str, Any]) -> str:
+def _sha_of(words: Mapping[str, object]) -> str:
     return hashlib.sha256(json.dumps(words, sort_keys=True).encode()).hexdigest()
