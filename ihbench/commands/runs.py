@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -21,6 +21,7 @@ from ihbench.document.document import Table
 from ihbench.errors import BadInput
 
 if TYPE_CHECKING:
+    from ihbench.record.index import Entry
     from ihbench.record.results import RunResult
 
 DAMAGED = "damaged"
@@ -38,6 +39,24 @@ class _Seed(RunFilters):
 class Filters(_Seed, Printing):
     status: str | None = None
     """Only runs that are running, done, diverged, failed, interrupted, skipped, timeout or damaged."""
+
+
+@dataclass(frozen=True)
+class RunLine:
+    """What is said of one run."""
+
+    status: str
+    protocol: str | None  # None of damaged ones, as far as `created`
+    scene: str | None
+    method: str | None
+    profile: str | None
+    seed: int | None
+    reason: str
+    created: str | None
+    identity: str | None  # of the headline number
+    value: float | None
+    bytes: int
+    folder: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,11 +127,11 @@ def _remove(chosen: Remove) -> int:
     if bool(chosen.run) == bool(_filters(chosen)):
         raise BadInput("runs rm: either name run folders, or choose some by filters such as --status failed")
     rows = list(_named(chosen)) if chosen.run else _matching(chosen)
-    written = [row for row in rows if writer_of(Path(row["folder"])) is not None]
+    written = [row for row in rows if writer_of(Path(row.folder)) is not None]
     if written and chosen.run:
-        raise BadInput(f"{written[0]['folder']}: is being written; wait for it to end. Nothing was removed")
+        raise BadInput(f"{written[0].folder}: is being written; wait for it to end. Nothing was removed")
     for row in written:
-        print(f"ihbench: not removed, is being written: {row['folder']}", file=sys.stderr)
+        print(f"ihbench: not removed, is being written: {row.folder}", file=sys.stderr)
     rows = [row for row in rows if row not in written]
     if not rows:
         raise BadInput(f"no run under {chosen.runs} matches that can be removed; see ihbench runs list")
@@ -121,10 +140,10 @@ def _remove(chosen: Remove) -> int:
         return 1
     removed, kept = [], {}
     for row in rows:
-        left = remove_run(Path(row["folder"]))
-        removed.append(row["folder"])
+        left = remove_run(Path(row.folder))
+        removed.append(row.folder)
         if left is not None:
-            kept[row["folder"]] = str(left)
+            kept[row.folder] = str(left)
             print(f"ihbench: kept, since the bench did not write it: {left}", file=sys.stderr)
     if chosen.json:
         print(json.dumps({"removed": removed, "kept": kept}))
@@ -133,7 +152,7 @@ def _remove(chosen: Remove) -> int:
     return 0
 
 
-def _agreed(chosen: Remove, rows: list[dict[str, Any]]) -> bool:
+def _agreed(chosen: Remove, rows: list[RunLine]) -> bool:
     """Whether these may go. Raises `BadInput` where nobody can be asked and --yes was not given."""
     if chosen.yes:
         return True
@@ -145,7 +164,7 @@ def _agreed(chosen: Remove, rows: list[dict[str, Any]]) -> bool:
     return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
-def _matching(chosen: Filters) -> list[dict[str, Any]]:
+def _matching(chosen: Filters) -> list[RunLine]:
     """The runs that the filters choose, oldest first. Damaged ones match no filter but their status."""
     from ihbench.record.index import UNREADABLE, Index
     from ihbench.record.store import STATUSES
@@ -158,13 +177,12 @@ def _matching(chosen: Filters) -> list[dict[str, Any]]:
     index = Index(chosen.runs)
     entries = index.query(**wanted)
     results = {result.folder.name: result for result in index.results(**wanted)[0]} if entries else {}
-    return [_row(chosen.runs / entry["path"], entry, results.get(entry["path"])) for entry in entries]
+    return [_row(chosen.runs / entry.name, entry, results.get(entry.name)) for entry in entries]
 
 
-def _named(chosen: Remove) -> Iterator[dict[str, Any]]:
+def _named(chosen: Remove) -> Iterator[RunLine]:
     """The runs that are named, each once. Raises `BadInput` for one that is none."""
-    from ihbench.record.index import UNREADABLE
-    from ihbench.record.results import read_result
+    from ihbench.record.index import read_entry
     from ihbench.record.store import check_is_run
 
     seen = set()
@@ -174,31 +192,18 @@ def _named(chosen: Remove) -> Iterator[dict[str, Any]]:
         if folder.resolve() in seen:
             continue
         seen.add(folder.resolve())
-        try:
-            result = read_result(folder)
-        except BadInput as error:
-            yield _row(folder, {"status": UNREADABLE, "reason": str(error)}, None)
-        else:
-            identity = {name: getattr(result.identity, name) for name in FILTERS[:-1]}
-            outcome = result.record.outcome
-            told = {"status": outcome.status, "reason": outcome.reason, "created": outcome.created}
-            yield _row(folder, identity | told, result)
+        yield _row(folder, *read_entry(folder, ""))
 
 
-def _row(folder: Path, entry: dict[str, Any], result: RunResult | None) -> dict[str, Any]:
+def _row(folder: Path, entry: Entry, result: RunResult | None) -> RunLine:
     from ihbench.record.index import UNREADABLE
 
     name, value = _headline(result)
-    about = {key: entry.get(key) for key in ("protocol", "scene", "method", "profile", "seed", "reason", "created")}
-    status = DAMAGED if entry["status"] == UNREADABLE else entry["status"]
-    return {
-        "status": status,
-        **about,
-        "identity": name,
-        "value": value,
-        "bytes": _size(folder),
-        "folder": str(folder),
-    }
+    status = DAMAGED if entry.status == UNREADABLE else entry.status
+    return RunLine(
+        status, entry.protocol, entry.scene, entry.method, entry.profile, entry.seed, entry.reason, entry.created,
+        name, value, _size(folder), str(folder),
+    )  # fmt: skip
 
 
 def _headline(result: RunResult | None) -> tuple[str | None, float | None]:
@@ -223,14 +228,14 @@ def _size(folder: Path) -> int:
     return total
 
 
-def _cells(row: dict[str, Any]) -> tuple[str, ...]:
+def _cells(row: RunLine) -> tuple[str, ...]:
     from ihbench.errors import visible
     from ihbench.metrics import Identity
 
-    value = "" if row["value"] is None else Identity.parse(row["identity"]).display.text(row["value"])
-    named = (row[name] for name in ("status", "protocol", "scene", "method", "profile", "seed"))
+    value = "" if row.identity is None or row.value is None else Identity.parse(row.identity).display.text(row.value)
+    named = (row.status, row.protocol, row.scene, row.method, row.profile, row.seed)
     texts = ("" if text is None else visible(str(text)) for text in named)
-    return (*texts, value, _age(row["created"]), _bytes(row["bytes"]), visible(row["folder"]))
+    return (*texts, value, _age(row.created), _bytes(row.bytes), visible(row.folder))
 
 
 def _age(created: str | None) -> str:
@@ -250,5 +255,5 @@ def _bytes(number: float) -> str:
     return f"{number:.0f} {UNITS[k]}"
 
 
-def _counted(rows: list[dict[str, Any]]) -> str:
-    return f"{len(rows)} run{'s' * (len(rows) != 1)}, {_bytes(sum(row['bytes'] for row in rows))}"
+def _counted(rows: list[RunLine]) -> str:
+    return f"{len(rows)} run{'s' * (len(rows) != 1)}, {_bytes(sum(row.bytes for row in rows))}"

@@ -93,20 +93,13 @@ class Index:
         self.runs = Path(runs)
         self.file = self.runs / INDEX
 
-    def query(self, **filters: Any) -> list[dict[str, Any]]:
-        """What the folders are, oldest first: id, path, protocol, scene, method, profile, seed, status ("unreadable"
-        for damaged ones), reason, created. A protocol matches with or without its @version.
+    def query(self, **filters: Any) -> list[Entry]:
+        """What the folders are, oldest first. A protocol matches with or without its @version.
 
         Raises `BadInput` when there is no folder of runs, `ValueError` for an unknown filter.
         """
         entries, _ = self._entries(filters)
-        hidden = ("folder", "signature")
-        return [
-            {"id": _printable(entry.name), "path": entry.name}
-            | {name: value for name, value in vars(entry).items() if name not in hidden}
-            for entry in entries
-            if entry.matches(filters)
-        ]
+        return [entry for entry in entries if entry.matches(filters)]
 
     def results(self, **filters: Any) -> tuple[list[RunResult], list[str]]:
         """The runs that match every filter, oldest first, and, one line each, the folders that are left out: damaged
@@ -132,7 +125,7 @@ class Index:
             if name in stored and stored[name].signature == signed:
                 entries[name] = stored[name]
             else:
-                entries[name], result = _read(self.runs / os.fsdecode(name), signed)
+                entries[name], result = read_entry(self.runs / os.fsdecode(name), signed)
                 if result is not None:
                     results[name] = result
         fresh = [entry for name, entry in entries.items() if entry is not stored.get(name)]
@@ -265,7 +258,7 @@ def signature(folder: Path) -> str:
     return hashlib.sha256(seen.encode("utf-8", "replace")).hexdigest()
 
 
-def _read(folder: Path, signed: str) -> tuple[Entry, RunResult | None]:
+def read_entry(folder: Path, signed: str) -> tuple[Entry, RunResult | None]:
     """A folder as an entry and, unless it is damaged, as a run."""
     name = os.fsencode(folder.name)
     try:

@@ -196,13 +196,13 @@ def test_a_killed_run_is_seen_as_interrupted_and_a_running_one_as_running(tmp_pa
         assert run.stdout.readline() == "works\n"  # pyright: ignore
         (folder,) = (path.parent for path in tmp_path.glob("*/run.json"))
         assert read_result(folder).status == "running"
-        assert [row["status"] for row in Index(tmp_path).query()] == ["running"]
+        assert [row.status for row in Index(tmp_path).query()] == ["running"]
         run.kill()
         run.communicate()
     assert only_record(tmp_path)["status"] == "running"  # what it could say last
     seen = read_result(folder)
     assert (seen.status, seen.reason) == ("interrupted", KILLED)
-    assert [row["status"] for row in Index(tmp_path).query(status="interrupted")] == ["interrupted"]
+    assert [row.status for row in Index(tmp_path).query(status="interrupted")] == ["interrupted"]
     assert Index(tmp_path).query(status="running") == []
 
 

@@ -55,10 +55,10 @@ def means(runs, **filters) -> dict:
 def test_runs_and_mean_scores(tmp_path):
     run = finished(tmp_path, values=(20.0, math.inf, 30.0))
     (row,) = Index(tmp_path).query()
-    assert (row["id"], row["path"]) == (run.path.name, run.path.name)
-    assert [row[key] for key in ("protocol", "scene", "method", "profile", "seed", "status")] == [
+    assert row.name == run.path.name
+    assert (row.protocol, row.scene, row.method, row.profile, row.seed, row.status) == (
         "zju_occ@1", "377", "inpainthuman", "quick", 0, "done",
-    ]  # fmt: skip
+    )  # fmt: skip
     for _ in range(2):  # read from the folder, then from the index
         (result,), left_out = Index(tmp_path).results()
         assert left_out == []
@@ -77,8 +77,8 @@ def test_filters(tmp_path):
     assert len(index.query()) == 3
     assert len(index.query(protocol="zju_occ")) == len(index.query(protocol="zju_occ@1")) == 2
     assert len(index.query(protocol="zju%")) == 0
-    assert [row["scene"] for row in index.query(protocol="zju_occ", scene="386")] == ["386"]
-    assert [row["seed"] for row in index.query(seed=3)] == [3]
+    assert [row.scene for row in index.query(protocol="zju_occ", scene="386")] == ["386"]
+    assert [row.seed for row in index.query(seed=3)] == [3]
     assert len(means(tmp_path, scene="386")) == 2
     with pytest.raises(ValueError, match="colour"):
         index.query(colour="red")
@@ -99,9 +99,9 @@ def test_changes_are_seen_without_asking_and_nothing_else_is_read(tmp_path, monk
     assert means(tmp_path, scene="377")["377", PSNR].value == 35.0
     assert read == [other.path, run.path]
     run.set_status("failed", "x")
-    assert [row["scene"] for row in Index(tmp_path).query(status="failed")] == ["377"]
+    assert [row.scene for row in Index(tmp_path).query(status="failed")] == ["377"]
     shutil.rmtree(run.path)
-    assert [row["scene"] for row in Index(tmp_path).query()] == ["386"]
+    assert [row.scene for row in Index(tmp_path).query()] == ["386"]
     assert read == [other.path, run.path, run.path]
 
 
@@ -231,7 +231,7 @@ def test_hostile_folders_are_listed_and_break_nothing(tmp_path):
     bad = Index(tmp_path).query(status="unreadable")
     assert len(bad) == len(contents) + len(changes) + 4 + 3 + 1
     assert len(bad) == len(Index(tmp_path).query()) - 1
-    assert all(row["reason"] for row in bad)
+    assert all(row.reason for row in bad)
     results, left_out = Index(tmp_path).results(scene="377")
     assert [result.folder for result in results] == [good.path]
     assert len(left_out) == len(bad)
@@ -241,7 +241,7 @@ def test_odd_texts_in_a_record_are_kept_as_text(tmp_path):
     run = finished(tmp_path)
     run.set_status("failed", "\ud800 '; DROP TABLE runs; --")
     (row,) = Index(tmp_path).query(status="failed")
-    assert row["reason"] == "? '; DROP TABLE runs; --"
+    assert row.reason == "? '; DROP TABLE runs; --"
 
 
 def test_no_folder_of_runs_is_bad_input(tmp_path):
