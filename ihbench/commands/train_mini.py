@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from ihbench.commands.options.device import check_device
 from ihbench.diffusion.mini.training import MiniTraining
 from ihbench.errors import BadInput
+
+if TYPE_CHECKING:
+    from ihbench.diffusion.mini.validation import Validation
 
 TRAINING = "training"  # folder in the output: state and loss curve
 
@@ -36,11 +39,11 @@ def main(argv: list[str]) -> int:
 
     chosen = options(TrainMiniOptions, argv, "train-mini", "Train the small diffusion backbone.")
     result = _train(chosen)
-    print(json.dumps(result) if chosen.json else _told(result, chosen.out))
+    print(json.dumps(asdict(result)) if chosen.json else _told(result, chosen.out))
     return 0
 
 
-def _train(chosen: Any) -> dict[str, Any]:
+def _train(chosen: TrainMiniOptions) -> Validation:
     from ihbench.clock.progress import Progress
     from ihbench.diffusion.mini.card import write_card
     from ihbench.diffusion.mini.folder import SHIPPED, check_mini
@@ -92,6 +95,6 @@ def _check_out(out: Path) -> None:
         raise BadInput(f"--out {out}: holds {names[0]}, not of a training of mini; choose another folder") from error
 
 
-def _told(result: dict[str, Any], out: Path) -> str:
-    lines = [f"{name:<40}{value:6.2f} dB" for name, value in result["hidden_psnr"].items()]
-    return "\n".join([f"hidden pixels of {result['people']} unseen people:", *lines, f"backbone: {out}"])
+def _told(result: Validation, out: Path) -> str:
+    lines = [f"{name:<40}{value:6.2f} dB" for name, value in result.hidden_psnr.items()]
+    return "\n".join([f"hidden pixels of {result.people} unseen people:", *lines, f"backbone: {out}"])

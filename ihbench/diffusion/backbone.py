@@ -96,7 +96,7 @@ class Backbone:
     ) -> Tensor:
         """What the scheduler's `prediction_type` says: noise, velocity or the clean latents."""
         noisy = noisy.to(self.dtype)  # the autoencoder may be kept in fp32
-        residuals: dict[str, Any] = {}
+        residuals: dict[str, Tensor | list[Tensor]] = {}
         if parts is not None:
             down, middle = self.controlnet(
                 noisy, timesteps, encoder_hidden_states=text, controlnet_cond=parts.to(self.dtype), return_dict=False

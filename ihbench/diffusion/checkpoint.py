@@ -54,7 +54,10 @@ def find_folder(where: str, option: str) -> Path:
         ) from error
 
 
-def read_json(path: Path) -> dict[str, Any]:
+Config = dict[str, Any]  # of a model of diffusers or transformers, as they write it
+
+
+def read_json(path: Path) -> Config:
     try:
         found = json.loads(read_text(path, "a JSON file"))
     except (BadInput, ValueError, RecursionError) as error:

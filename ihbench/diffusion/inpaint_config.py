@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, Any, Literal, get_args
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal, get_args
 
 from ihbench.config_fields import STEPS, Within, check
 from ihbench.errors import BadInput
@@ -136,11 +136,11 @@ class InpaintConfig:
 
     def settled(self) -> Settled:
         """The values that are in force, with the backbone's own in the place of None."""
-        own = dict(OWN[self.backbone])
+        own = OWN[self.backbone]
         if self.backbone == "mini" and self.tune == "lora":
-            own["lora_lr"] = LORA_OF_MINI
-        given = {name: getattr(self, name) for name in own if getattr(self, name) is not None}
-        return Settled(**own | given)
+            own = replace(own, lora_lr=LORA_OF_MINI)
+        given = {name: getattr(self, name) for name in vars(own) if getattr(self, name) is not None}
+        return replace(own, **given)
 
     @property
     def uses_diffusion(self) -> bool:
@@ -159,16 +159,14 @@ SD2_WANTED = (
 )
 
 # what a field that is None means
-OWN: dict[str, dict[str, Any]] = {
-    "mini": {
-        "vectors": 4, "ti_lr": 2e-2, "tune": "all", "lora_lr": 3e-4, "control_lr": 3e-4, "sampler_steps": 6,
-        "noise": 0.0, "guidance": 1.0,
-    },
-    "sd2": {
-        "vectors": 1, "ti_lr": 5e-4, "tune": "lora", "lora_lr": 1e-4, "control_lr": 1e-5, "sampler_steps": 50,
-        "noise": 1.0, "guidance": 5.0,
-    },
-}  # fmt: skip
+OWN = {
+    "mini": Settled(
+        vectors=4, ti_lr=2e-2, tune="all", lora_lr=3e-4, control_lr=3e-4, sampler_steps=6, noise=0.0, guidance=1.0
+    ),
+    "sd2": Settled(
+        vectors=1, ti_lr=5e-4, tune="lora", lora_lr=1e-4, control_lr=1e-5, sampler_steps=50, noise=1.0, guidance=5.0
+    ),
+}
 LORA_OF_MINI = 1e-3  # step size: so few weights need longer steps
 
 QUICK_INPAINT = InpaintConfig()

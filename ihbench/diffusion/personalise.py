@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -248,7 +247,7 @@ class Personaliser:
     def _save(
         self, state: str, step: int, named: dict[str, nn.Parameter], optimizer: torch.optim.Optimizer, curve: Curve
     ) -> None:
-        tensors: dict[str, Any] = {f"p.{name}": p.detach() for name, p in named.items()}
+        tensors: dict[str, Tensor] = {f"p.{name}": p.detach() for name, p in named.items()}
         if step < self._steps(state):
             for name, p in named.items():
                 tensors |= {f"adam.{name}.{key}": value for key, value in optimizer.state[p].items()}

@@ -26,6 +26,7 @@ import torch
 from ihbench.diffusion.backbone import Backbone, LatentAutoencoder
 from ihbench.diffusion.checkpoint import (
     CONVERT,
+    Config,
     UnreadModule,
     empty_module,
     find_folder,
@@ -181,7 +182,7 @@ def _check_layout(folder: Path) -> None:
         )
 
 
-def _check_model(folder: Path, configs: dict[str, dict[str, Any]]) -> None:
+def _check_model(folder: Path, configs: dict[str, Config]) -> None:
     """Stable Diffusion 2 inpainting by its layers; widths are only compared with each other."""
     unet, vae, text = configs["unet"], configs["vae"], configs["text_encoder"]
     where = folder / "unet" / "config.json"
@@ -211,7 +212,7 @@ def _check_model(folder: Path, configs: dict[str, dict[str, Any]]) -> None:
         )
 
 
-def _check_sd2_unet(where: Path, unet: dict[str, Any]) -> None:
+def _check_sd2_unet(where: Path, unet: Config) -> None:
     """What sets the UNet of Stable Diffusion 2 apart, whatever its width and its input channels."""
     if unet.get("_class_name") != "UNet2DConditionModel":
         raise BadInput(f"{where}: {unet.get('_class_name')}, expected UNet2DConditionModel; {WRONG_MODEL}")
@@ -230,7 +231,7 @@ def _check_sd2_unet(where: Path, unet: dict[str, Any]) -> None:
         )
 
 
-def _unread(folder: Path, configs: dict[str, dict[str, Any]]) -> tuple[Any, Any, Any]:
+def _unread(folder: Path, configs: dict[str, Config]) -> tuple[Any, Any, Any]:
     from diffusers import AutoencoderKL, UNet2DConditionModel
 
     unet = empty_module(folder / "unet", lambda: UNet2DConditionModel.from_config(configs["unet"]))
@@ -249,7 +250,7 @@ def _vae_name(stored: str) -> str:
 
 
 def _unread_control(
-    control: str | None, unet: dict[str, Any], vae: dict[str, Any]
+    control: str | None, unet: Config, vae: Config
 ) -> tuple[UnreadModule | None, UnreadModule | None]:
     """The ControlNet of `control`, or the UNet to make one from; neither when neither is given. `unet` and `vae` are
     the configurations that it has to go with."""
@@ -295,7 +296,7 @@ def _unread_control(
     return (None, unread) if kind == "UNet2DConditionModel" else (unread, None)
 
 
-def _halvings(what: str, config: dict[str, Any]) -> int:
+def _halvings(what: str, config: Config) -> int:
     """Pixels along a latent pixel."""
     return 2 ** (len(config[f"{what}_out_channels"]) - 1)
 
@@ -329,7 +330,7 @@ def _scheduler(folder: Path) -> Any:
         raise BadInput(f"{where}: not a usable configuration ({error}); fetch it again") from error
 
 
-def _tokenizer(folder: Path, text: dict[str, Any]) -> Any:
+def _tokenizer(folder: Path, text: Config) -> Any:
     """CLIP's tokenizer. `CLIPTokenizerFast` reads both layouts in transformers 4, and is `CLIPTokenizer` in 5."""
     from transformers import CLIPTokenizerFast  # type: ignore[attr-defined]  # made on the fly in 5
 

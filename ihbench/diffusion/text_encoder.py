@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-from ihbench.diffusion.checkpoint import UnreadModule, empty_module
+from ihbench.diffusion.checkpoint import Config, UnreadModule, empty_module
 
 TEXT_STEM = "model"
 FIELDS = (
@@ -16,7 +15,7 @@ FIELDS = (
 EXTRAS = ("vision_model.", "visual_projection.", "text_projection.", "logit_scale")  # of a whole CLIP
 
 
-def unread_text_encoder(folder: Path, config: dict[str, Any]) -> UnreadModule:
+def unread_text_encoder(folder: Path, config: Config) -> UnreadModule:
     """The encoder of a folder whose configuration was read. Raises `BadInput` for tensors that do not fit it."""
     from transformers import CLIPTextConfig, CLIPTextModel
 

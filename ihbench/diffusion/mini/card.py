@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from ihbench import registry
 from ihbench.diffusion.mini.train_mini import curve_of
 from ihbench.diffusion.mini.training import MiniTraining
+from ihbench.diffusion.mini.validation import Validation
 from ihbench.files.atomic import write_json, write_text
 from ihbench.version import __version__
 
@@ -23,7 +23,7 @@ def write_card(
     folder: Path,
     config: MiniTraining,
     seconds: float,
-    validation: dict[str, Any],
+    validation: Validation,
     device: str = "cpu",
     start: Path | None = None,
 ) -> None:
@@ -41,7 +41,7 @@ def write_card(
     on = "" if device == "cpu" else f" --device {device}"
     on += "" if start is None else " --start EARLIER"
     before = [] if start is None else ["- Started from the weights of an earlier training:", *_quoted(start / CARD)]
-    rows = [f"| {name} | {value:.2f} |" for name, value in validation["hidden_psnr"].items()]
+    rows = [f"| {name} | {value:.2f} |" for name, value in validation.hidden_psnr.items()]
     thinned = curve[:: max(len(curve) // 20, 1)]
     points = [f"| {row['step']} | {row['loss']:.4f} | {row['seconds'] / 60:.0f} |" for row in thinned]
     write_text(folder / CARD, "\n".join([
@@ -61,8 +61,8 @@ def write_card(
         *before,
         "- Weights are rounded to 16 bit. Licence: that of ihbench.",
         "",
-        f"PSNR over the hidden pixels of {validation['people']} unseen procedural people behind a central strip over",
-        f"{validation['strip']:.0%} of them, not personalised:",
+        f"PSNR over the hidden pixels of {validation.people} unseen procedural people behind a central strip over",
+        f"{validation.strip:.0%} of them, not personalised:",
         "",
         "| painter | dB |",
         "|---|---|",

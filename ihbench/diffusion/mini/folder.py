@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-from ihbench.diffusion.checkpoint import CONVERT, has_pickles, read_json, weight_files
+from ihbench.diffusion.checkpoint import CONVERT, Config, has_pickles, read_json, weight_files
 from ihbench.diffusion.text_encoder import TEXT_STEM
 from ihbench.errors import BadInput
 from ihbench.files.paths import user_path
@@ -18,7 +17,7 @@ CLASSES = {"unet": "UNet2DConditionModel", "controlnet": "ControlNetModel", "cod
 HOW = "`ihbench train-mini --out DIR` makes one"
 
 
-def check_mini(folder: Path) -> tuple[Path, dict[str, dict[str, Any]]]:
+def check_mini(folder: Path) -> tuple[Path, dict[str, Config]]:
     """The folder and its parts' configurations. Raises `BadInput` for one that lacks a part, has pickles for weights,
     or holds another model, such as Stable Diffusion."""
     folder = user_path(folder)
@@ -39,7 +38,7 @@ def check_mini(folder: Path) -> tuple[Path, dict[str, dict[str, Any]]]:
     return folder, configs
 
 
-def _check_channels(folder: Path, configs: dict[str, dict[str, Any]]) -> None:
+def _check_channels(folder: Path, configs: dict[str, Config]) -> None:
     """Whether the parts fit each other."""
     codec, unet, control = configs["codec"], configs["unet"], configs["controlnet"]
     try:

@@ -34,7 +34,7 @@ TRAINED = ("unet", "controlnet", "text_encoder")
 RISE = 200  # steps of warming up
 
 
-def curve_of(folder: Path) -> list[dict[str, Any]]:
+def curve_of(folder: Path) -> list[dict[str, float]]:
     """The loss curve of a training, one row every fifty steps; of steps done twice after a kill, the later row."""
     rows = atomic.read_json_lines(folder / CURVE)
     return [row for _, row in sorted({row["step"]: row for row in rows}.items())]
@@ -260,6 +260,6 @@ class MiniTrainer:
             raise BadInput(f"{path}: not a readable training state ({error}); remove it to start again") from error
         self.step, self.seconds = step, seconds
 
-    def _note(self, row: dict[str, Any]) -> None:
+    def _note(self, row: dict[str, float]) -> None:
         path = self.folder / CURVE
         atomic.write_json_lines(path, [*(atomic.read_json_lines(path) if path.is_file() else ()), row])

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -26,7 +26,14 @@ STRIP = 0.5  # share of the person that the central strip hides
 PEOPLE = 48
 
 
-def validate(backbone: Backbone, dataset: Path, each: int, progress: Progress) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Validation:
+    people: int
+    strip: float
+    hidden_psnr: dict[str, float]  # by what paints, dB
+
+
+def validate(backbone: Backbone, dataset: Path, each: int, progress: Progress) -> Validation:
     """Hidden-body PSNR, pooled, on held-out people with a central strip; nothing is personalised."""
     people, device = registry.load("people", "procedural"), backbone.device
     store = CropDataset(dataset, "procedural", each, backbone.size)
@@ -60,7 +67,7 @@ def validate(backbone: Backbone, dataset: Path, each: int, progress: Progress) -
                 errors.setdefault(name, []).append(error.double().cpu().numpy())
             task.advance(len(rows))
     psnr = {name: float(-10 * np.log10(np.concatenate(parts).mean())) for name, parts in errors.items()}
-    return {"people": PEOPLE, "strip": STRIP, "hidden_psnr": psnr}
+    return Validation(PEOPLE, STRIP, psnr)
 
 
 def central_strip(person: NDArray[np.bool_], share: float = STRIP) -> NDArray[np.bool_]:
