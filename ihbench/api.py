@@ -135,7 +135,7 @@ class Ablation:
     """What `ablate` found: the table as Markdown and as numbers, and the runs that were done."""
 
     text: str
-    numbers: dict[str, Any]
+    numbers: Mapping[str, object]
     results: list[RunResult]
     problems: list[str]  # of runs that are not done
 

@@ -30,6 +30,7 @@ LONGEST_NAME, LONGEST_TEXT = 80, 2000  # characters
 MOST_ENTRIES = 10_000  # of a list
 
 Kind = TypeVar("Kind")
+Values = dict[str, Any]  # a field, named as `flat` names it -> its value, of any type
 
 
 @dataclass(frozen=True)
@@ -201,9 +202,9 @@ def rules(hint: Any) -> tuple[Within | MultipleOf, ...]:
     return (*own, *(rule for part in inside for rule in rules(part)))
 
 
-def flat(config: Any) -> dict[str, Any]:
+def flat(config: Any) -> Values:
     """Name -> value of a dataclass or a table; the fields of a nested one come as "outer.inner"."""
-    out: dict[str, Any] = {}
+    out: Values = {}
     table = isinstance(config, Mapping)
     for name, value in (config if table else _members(config)).items():
         if isinstance(value, Mapping) if table else is_config(value):
@@ -223,7 +224,7 @@ def with_fields(config: Any, values: Mapping[str, Any]) -> Any:
 
 def replaced(config: Kind, values: Mapping[str, Any]) -> Kind:
     """As `with_fields`, values unchecked."""
-    own: dict[str, Any] = {name: value for name, value in values.items() if "." not in name}
+    own: Values = {name: value for name, value in values.items() if "." not in name}
     for outer in dict.fromkeys(name.partition(".")[0] for name in values if "." in name):
         inner = {name.partition(".")[2]: value for name, value in values.items() if name.startswith(outer + ".")}
         nested = getattr(config, outer, None)
@@ -238,10 +239,10 @@ def is_config(value: Any) -> bool:
     return is_dataclass(value) and not isinstance(value, type)
 
 
-def hints(kind: type) -> dict[str, Any]:
+def hints(kind: type) -> dict[str, object]:
     """Name -> type of every field of a dataclass, nested ones as in `flat`; one that is written as a text (it has
     `from_text`) is a value."""
-    out: dict[str, Any] = {}
+    out: dict[str, object] = {}
     own = _hints(kind)
     for field in fields(kind):
         hint = own[field.name]
@@ -330,7 +331,7 @@ def _read_fields(kind: type[Kind], value: Any, where: str, key: str, strict: boo
 
 
 @cache
-def _hints(kind: type) -> dict[str, Any]:
+def _hints(kind: type) -> dict[str, object]:
     return get_type_hints(kind, include_extras=True)
 
 
@@ -340,7 +341,7 @@ def _table(value: Any, where: str, key: str) -> Mapping[str, Any]:
     return value
 
 
-def _members(config: Any) -> dict[str, Any]:
+def _members(config: Any) -> Values:
     return {field.name: getattr(config, field.name) for field in fields(config)}
 
 

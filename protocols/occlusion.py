@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -206,7 +205,7 @@ def _per_frame(
         person = request.silhouette(frame)
         return hidden(frame, person) if person.any() else np.zeros(person.shape, bool)
 
-    record: dict[str, Any] = {"fraction": request.rule.fraction}
+    record: dict[str, float] = {"fraction": request.rule.fraction}
     if rule in ("blocks", "object"):
         record["seed"] = request.rule.seed or 0
     return Occlusion(rule, of, record)

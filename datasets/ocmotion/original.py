@@ -401,7 +401,7 @@ def write_annot(path: Path, sequences: Sequence[Sequence[Sequence[AnnotFrame]]])
     write_pickle(path, [[[_entry(frame) for frame in camera] for camera in sequence] for sequence in sequences])
 
 
-def _entry(frame: AnnotFrame) -> dict[str, Any]:
+def _entry(frame: AnnotFrame) -> dict[str, object]:
     K, E = stored_camera(frame.camera, "OcMotion")
     people = {
         key: {

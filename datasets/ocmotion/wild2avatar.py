@@ -18,7 +18,6 @@ import json
 from collections.abc import Iterable, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -187,7 +186,7 @@ def read_metadata(path: Path) -> dict[str, dict]:
     return content
 
 
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _once(pairs: list[tuple[str, atomic.Json]]) -> dict[str, atomic.Json]:
     """A JSON object; the parser itself would silently keep the last of two equal keys."""
     content = dict(pairs)
     if len(content) < len(pairs):

@@ -291,7 +291,7 @@ def _camera(name: str, entry: Any, path: Path) -> Camera:
     return Camera(K, R, t, width, height, distortion if distortion is not None and distortion.any() else None)
 
 
-def _pixels(entry: dict[str, Any], key: str, where: str) -> int:
+def _pixels(entry: Mapping[str, object], key: str, where: str) -> int:
     value = entry.get(key)
     if type(value) is not int or not 0 < value <= 2**16:
         raise BadInput(f"{where}: {key}: expected a whole number of pixels, found {_shown(value)}")
@@ -501,7 +501,7 @@ def write_poses(
     if root == "zju":
         assert body is not None
         transl = np.stack([zju_root(p, body)[1] for p in body_poses])
-    arrays: dict[str, Any] = {
+    arrays: dict[str, NDArray] = {
         "frames": np.arange(len(pose)) if frames is None else np.asarray(frames, np.int64),
         "pose": pose,
         "betas": np.stack([p.betas for p in body_poses]),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import pickle
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 from ihbench.files import atomic
 
 
-def write_object(path: Path, value: dict[str, Any]) -> None:
+def write_object(path: Path, value: Mapping[str, object]) -> None:
     """A dictionary as np.save would write it; `ihbench.files.safe_pickle.load_npy` reads it."""
     buffer = io.BytesIO()
     np.lib.format.write_array_header_1_0(buffer, {"descr": "|O", "fortran_order": False, "shape": ()})

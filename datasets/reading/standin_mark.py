@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from ihbench.errors import BadInput
 from ihbench.files import atomic
@@ -11,7 +10,7 @@ from ihbench.files import atomic
 STANDIN_FILE = "STANDIN.json"  # in the folder that holds the subjects
 
 
-def standin_mark(root: Path) -> dict[str, Any]:
+def standin_mark(root: Path) -> dict[str, atomic.Json]:
     """What STANDIN.json in the folder of the subjects says: version, seed and body_sha; empty for real data."""
     path = root / STANDIN_FILE
     if not path.is_file():

@@ -211,7 +211,7 @@ def write_pickles(
         if with_betas:
             infos[name]["betas"] = body_pose.betas.copy()
     mean = np.mean([pose.betas for _, pose in views.values()], 0)
-    canonical: dict[str, Any] = {"joints": body.shaped(mean)[1]}
+    canonical: dict[str, NDArray[np.float64]] = {"joints": body.shaped(mean)[1]}
     if with_betas:
         canonical["avg_betas"] = mean
     write_pickle(folder / "cameras.pkl", cameras)

@@ -24,8 +24,8 @@ class BodyPose:
 
     def __post_init__(self) -> None:
         """Raises `BadValue` for other shapes, and for angles that can only be degrees."""
-        given: dict[str, Any] = {"pose": self.pose, "betas": self.betas, "transl": self.transl}
-        for name, value in given.items():
+        for name in ("pose", "betas", "transl"):
+            value: Any = getattr(self, name)
             value = np.array(value.detach().cpu().double().numpy() if hasattr(value, "detach") else value, np.float64)
             value.setflags(write=False)
             object.__setattr__(self, name, value)

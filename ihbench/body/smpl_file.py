@@ -7,6 +7,7 @@ vchoutas/smplx smplx/body_models.py and SMPL's release notes.
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -80,11 +81,10 @@ def find_model_file(folder: Path, gender: str = "neutral") -> Path:
     )
 
 
-def read_arrays(path: Path) -> dict[str, Any]:
-    """The entries of a model file that this bench uses, as plain arrays (and `name` as text). Shapes unchecked."""
+def read_arrays(path: Path) -> dict[str, NDArray]:
+    """The entries of a model file that this bench uses, as plain arrays (`name` of one text). Shapes unchecked."""
     if path.suffix.lower() == ".npz":
-        arrays = read_npz(path, (*REQUIRED, *OPTIONAL, "name"))
-        return arrays | {"name": str(arrays["name"])} if "name" in arrays else dict(arrays)
+        return read_npz(path, (*REQUIRED, *OPTIONAL, "name"))
     if path.suffix.lower() != ".pkl":
         raise BadInput(f"{path}: expected a body file that ends in .pkl or .npz; {WHERE_SMPL_IS}")
     raw = load_pickle(path)
@@ -132,7 +132,7 @@ def _foreign_array(value: ForeignObject, where: str) -> NDArray:
     raise BadInput(f"{where}: a {value.kind} object this bench cannot read; save the file again with plain arrays")
 
 
-def _body_from_arrays(arrays: dict[str, Any], path: Path, uv_path: Path | None, n_betas: int | None) -> Body:
+def _body_from_arrays(arrays: Mapping[str, NDArray], path: Path, uv_path: Path | None, n_betas: int | None) -> Body:
     check_arrays(arrays, path)
     faces = arrays["f"].astype(np.int32)
     weights = arrays["weights"].astype(np.float64)
@@ -161,12 +161,12 @@ def _body_from_arrays(arrays: dict[str, Any], path: Path, uv_path: Path | None, 
         faces=faces,
         uv=uv,
         uv_faces=uv_faces,
-        name=arrays.get("name", "smpl"),
+        name=str(arrays.get("name", "smpl")),
         face_landmarks=arrays["face_landmarks"].astype(np.float64) if "face_landmarks" in arrays else None,
     )
 
 
-def check_arrays(arrays: dict[str, Any], path: Path) -> None:
+def check_arrays(arrays: Mapping[str, NDArray], path: Path) -> None:
     """Raise `BadInput` unless the arrays make one consistent SMPL-shaped body."""
     missing = [key for key in REQUIRED if key not in arrays]
     if missing:

@@ -80,7 +80,7 @@ def _ablate(chosen: AblateOptions) -> int:
 
 def ablated(
     chosen: AblateOptions, vary: Mapping[str, Sequence[Any]], switches: Mapping[str, Any], progress: Progress
-) -> tuple[list[Block], dict[str, Any], list[CellOutcome]]:
+) -> tuple[list[Block], Mapping[str, object], list[CellOutcome]]:
     """Do the runs of a suite, or of the grid `vary`, with `switches` on every variant: the table and its
     numbers, and how each run ended. The options' own words for both are not read. Raises `BadInput`."""
     from ihbench.clock.machine import usable_cores
@@ -108,7 +108,7 @@ def ablated(
     return blocks, numbers, outcomes
 
 
-def write_out(chosen: AblateOptions, blocks: Sequence[Block], numbers: dict[str, Any]) -> None:
+def write_out(chosen: AblateOptions, blocks: Sequence[Block], numbers: Mapping[str, object]) -> None:
     """Write the table into the folder that was asked for, if one was."""
     from ihbench.document.document import write
     from ihbench.record import outputs

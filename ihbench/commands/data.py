@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -15,6 +15,9 @@ from ihbench.commands.options.printing import Printing
 from ihbench.config_fields import LARGEST_CAST, SEEDS, Within
 from ihbench.document.document import Block, Heading, Table
 from ihbench.errors import BadInput
+
+if TYPE_CHECKING:
+    from ihbench.scene.copy_report import CopyReport
 
 
 @dataclass(frozen=True)
@@ -80,7 +83,7 @@ def _check(chosen: Check) -> int:
             mesh, warnings = look_at_mesh(body)
             report = replace(report, body_mesh=mesh, warnings=warnings)
         found = report.as_json()
-        chosen.show(found, _blocks(found), "\n".join(_lines(found)))
+        chosen.show(found, _blocks(report), "\n".join(_lines(found)))
         return 0 if report.ok else 1
     other = folder_nearby(folder, registry.names("dataset"))
     if other is not None:
@@ -88,11 +91,12 @@ def _check(chosen: Check) -> int:
     raise BadInput(f"data folder {folder}: no known layout ({'; '.join(complaints)})")
 
 
-def _blocks(found: dict[str, Any]) -> list[Block]:
+def _blocks(report: CopyReport) -> list[Block]:
     """A table of what is said of the copy, and one for each subject."""
-    blocks: list[Block] = [Heading(1, f"Data check: {found['root']}")]
-    for about in ({key: item for key, item in found.items() if key != "subjects"}, *found["subjects"]):
-        blocks.append(Heading(2, str(about.get("subject", found["dataset"]))))
+    blocks: list[Block] = [Heading(1, f"Data check: {report.root}")]
+    whole = {key: item for key, item in report.as_json().items() if key != "subjects"}
+    for about in (whole, *(subject.as_json() for subject in report.subjects)):
+        blocks.append(Heading(2, str(about.get("subject", report.dataset))))
         rows: list[tuple[str, str]] = []
         for key, item in about.items():
             several = {f"{key}: {k}": v for k, v in item.items()} if isinstance(item, dict) else {key: item}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
@@ -48,7 +48,7 @@ def _show(chosen: Show) -> int:
     return 0
 
 
-def _shown(protocol: Protocol) -> dict[str, Any]:
+def _shown(protocol: Protocol) -> dict[str, object]:
     absent = withheld(protocol.metrics.regions) if protocol.occlusion.in_scene else {}
     ends = {"profile": protocol.profile, "digest": protocol.digest}
     return {**protocol.content, **({"absent": absent} if absent else {}), **ends}

@@ -63,7 +63,7 @@ def write_rows(rows: Sequence[Mapping[str, Any]], first: Sequence[str] = ()) -> 
     return out.getvalue()
 
 
-def _cells(table: Table, footnotes: Mapping[str, str]) -> Iterator[dict[str, Any]]:
+def _cells(table: Table, footnotes: Mapping[str, str]) -> Iterator[dict[str, object]]:
     columns = [cell for cell in table.head if isinstance(cell, Column)]
     for k, label in enumerate(table.labels):
         for column, number in zip(columns, table.numbers(k), strict=True):
@@ -80,7 +80,7 @@ def _cells(table: Table, footnotes: Mapping[str, str]) -> Iterator[dict[str, Any
             }
 
 
-def table_data(table: Table, footnotes: Mapping[str, str]) -> dict[str, Any]:
+def table_data(table: Table, footnotes: Mapping[str, str]) -> dict[str, object]:
     """A table of numbers as plain data."""
     head = [plain_text(cell) for cell in table.head]
     ticks = slice(table.left, table.left + table.ticks)
@@ -108,7 +108,7 @@ def table_data(table: Table, footnotes: Mapping[str, str]) -> dict[str, Any]:
     }
 
 
-def _number(number: Number, footnotes: Mapping[str, str]) -> dict[str, Any]:
+def _number(number: Number, footnotes: Mapping[str, str]) -> dict[str, object]:
     return {
         "text": f"{number.text} {number.interval}".rstrip(),
         "value": number.value,

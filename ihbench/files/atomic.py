@@ -19,7 +19,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeAlias
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from ihbench.files import removal
 from ihbench.files.paths import cache_folder
 from ihbench.files.regular import read_bytes
 
+Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | None"
 NON_FINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 MOST_LINKS = 40  # as the system follows
 # how an open stream of a process is named, by Linux and by others

@@ -216,7 +216,7 @@ def _parsed(kind: Any, value: str) -> str:
 
 
 @cache
-def _hints(kind: Any) -> dict[str, Any]:
+def _hints(kind: Any) -> dict[str, object]:
     return {name: hint for name, hint in get_type_hints(kind, include_extras=True).items() if name != MORE}
 
 

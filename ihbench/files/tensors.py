@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from ihbench.errors import BadInput
 from ihbench.files.regular import opened
 
+if TYPE_CHECKING:
+    from torch import Tensor
 
-def read_tensors(path: str | Path) -> dict[str, Any]:
+
+def read_tensors(path: str | Path) -> dict[str, Tensor]:
     """The dictionary in the file, on the CPU. Raises `BadInput` for one that is damaged or holds anything else."""
     import torch
 

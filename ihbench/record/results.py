@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from ihbench.config_fields import Values
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.metrics import Identity, Mean, Score, mean_over_frames
@@ -96,12 +97,12 @@ class RunResult:
         return self.identity.protocol, self.identity.protocol_digest, self.identity.profile, self.data
 
     @property
-    def planned(self) -> dict[str, Any]:
+    def planned(self) -> Values:
         """Switches that the plan has changed for this scene -> the value that was in force."""
         return {o.field: o.value for o in self.about.left_out or () if o.value is not None}
 
     @property
-    def switches(self) -> dict[str, Any]:
+    def switches(self) -> Values:
         """Dotted name -> value of the method's switches, as the scene's plan left them."""
         return self.identity.switches | self.planned
 
@@ -271,7 +272,7 @@ def _is_row_of(method: str, row: str) -> bool:
     return row == method or (row.startswith(f"{method} [") and row.endswith("]"))
 
 
-def summary(results: Iterable[RunResult]) -> dict[str, Any]:
+def summary(results: Iterable[RunResult]) -> dict[str, object]:
     """What `--json` prints of runs: strict JSON, numbers that are not finite as strings."""
     results = list(results)
     return {

@@ -17,6 +17,7 @@ from typing import Annotated, Any, Literal
 
 from ihbench.clock.events import Event
 from ihbench.clock.machine import Machine
+from ihbench.config_fields import Values
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.regular import read_bytes
@@ -113,7 +114,7 @@ class RunIdentity:
         return "+".join(part for part in self.protocol.split("+") if not part.startswith(f"{change}="))
 
     @property
-    def switches(self) -> dict[str, Any]:
+    def switches(self) -> Values:
         """Dotted name -> value of every switch of the method; lists are tuples."""
         return dict(_flat({name: value for name, value in self.config.items() if name not in ("keep", "outside")}))
 
@@ -386,7 +387,7 @@ def _parsed(file: Path, text: str, where: str = "") -> Any:
         raise BadInput(f"{file}{where}: not valid JSON ({str(error)[:200]})") from error
 
 
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _once(pairs: list[tuple[str, atomic.Json]]) -> dict[str, atomic.Json]:
     made = dict(pairs)
     if len(made) != len(pairs):
         raise ValueError("a key stands twice in one object")

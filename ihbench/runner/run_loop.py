@@ -22,7 +22,7 @@ from ihbench import config_fields, registry
 from ihbench.clock import machine
 from ihbench.clock.events import Reused
 from ihbench.clock.progress import Progress
-from ihbench.config_fields import SEEDS, flat, with_fields
+from ihbench.config_fields import SEEDS, Values, flat, with_fields
 from ihbench.errors import BadInput
 from ihbench.metrics import Identity, mean_over_frames
 from ihbench.record.finished_run import FinishedRun
@@ -68,7 +68,7 @@ class RunRequest:
         config_fields.check(self, "", ("seed", "device", "runs", "force", "keep", "share"))
 
 
-def configuration(method: str, profile: str, switches: dict[str, Any]) -> Any:
+def configuration(method: str, profile: str, switches: Values) -> Any:
     """A method's configuration under a profile, with some fields replaced. Raises `BadInput` for unknown fields."""
     config = method_spec(method).profile(profile)
     known = [*flat(config), *(field.name for field in fields(config))]
@@ -231,7 +231,7 @@ def _planned(request: RunRequest, measure: SceneMeasure) -> tuple[Any, list[Omis
     return config, taken + absent_regions(measure, request.protocol.metrics.regions), withheld
 
 
-def _changed(request: RunRequest, withheld: list[str]) -> dict[str, Any]:
+def _changed(request: RunRequest, withheld: list[str]) -> Values:
     """What sets the run apart from the profile: switches with their values, and as "keep" what the plan was not let
     to leave out (a `keep` that changed nothing is no difference)."""
     base = flat(method_spec(request.method).profile(request.protocol.profile))

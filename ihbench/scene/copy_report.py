@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import Any
 
 
 @dataclass
@@ -44,7 +43,7 @@ class SubjectReport:
         if text not in self.warnings:
             self.warnings.append(text)
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
         values = ((entry.name, getattr(self, entry.name)) for entry in fields(self))
         return {name: value for name, value in values if value not in (None, {})}
 
@@ -69,7 +68,7 @@ class CopyReport:
     def ok(self) -> bool:
         return not any(subject.problems for subject in self.subjects)
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
         """Plain data, without what has nothing to say."""
         of_body = {"body_mesh": self.body_mesh} | ({"warnings": list(self.warnings)} if self.warnings else {})
         return {

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +46,7 @@ class Occlusion:
 
     rule: str
     hidden: Callable[[int], Mask]  # raw frame number -> [H, W], original image; not to be written to
-    record: dict[str, Any]
+    record: Mapping[str, float]
     hides_nothing: bool = False  # in any frame
 
 

@@ -62,7 +62,7 @@ class SceneMeasure:
     turn_deg: float  # range of the root's heading over the training frames
     pixel_mm: float  # body millimetres per pixel of the protocol's image, median over views
     surface_mm: float  # side of a square of the body's area, mm: texel_mm(R) follows from it
-    occlusion: dict[str, Any]
+    occlusion: Mapping[str, str | float]
     in_scene: bool = False  # the occluder stands in the scene: test images are occluded, too
 
     def texel_mm(self, resolution: int) -> float:

@@ -20,6 +20,7 @@ from ihbench.config_fields import (
     Entries,
     Name,
     Text,
+    Values,
     Within,
     as_table,
     flat,
@@ -29,6 +30,7 @@ from ihbench.config_fields import (
     whole,
 )
 from ihbench.errors import BadInput
+from ihbench.files.atomic import Json
 from ihbench.files.regular import read_toml
 
 Region = Literal["full", "box", "body", "visible", "hidden", "never_seen"]
@@ -330,7 +332,7 @@ class Protocol(ProtocolFile):
         return f"{self.id}@{self.version}{self.changed}"
 
     @property
-    def content(self) -> dict[str, Any]:
+    def content(self) -> dict[str, Json]:
         """The merged file, as TOML and JSON have it."""
         return as_table(self, ProtocolFile)
 
@@ -351,7 +353,7 @@ class Protocol(ProtocolFile):
         its rule, cannot have.
         """
         called = {name: (flags or {}).get(name, f"--protocol.{name.replace('_', '-')}") for name in values}
-        new: dict[str, Any] = {}
+        new: Values = {}
         for name, value in values.items():
             if name not in CHOICES:
                 raise BadInput(f"{called[name]}: no choice of a protocol: {registry.nearest(name, list(CHOICES))}")
@@ -373,10 +375,10 @@ class Protocol(ProtocolFile):
         except ValueError as error:
             raise BadInput(f"protocol {self.name}{version}: {error}") from error
 
-    def _occlusion(self, new: dict[str, Any], shown: dict[str, Any], called: Mapping[str, str]) -> dict[str, Any]:
+    def _occlusion(self, new: Values, shown: Values, called: Mapping[str, str]) -> Values:
         """What follows from a changed occlusion; `shown` gets what of it the version shall say."""
         rule, fraction, covers = (new.get(name) for name in OCCLUSION)
-        out: dict[str, Any] = {}
+        out: Values = {}
         if fraction is not None and rule is None and self.occlusion.rule == "fixed-strip":
             rule = shown["occlusion.rule"] = self.occlusion.unlisted
         if rule is not None:
@@ -506,12 +508,13 @@ def _under(file: ProtocolFile, profile: str) -> Protocol:
     return Protocol(**{field.name: getattr(file, field.name) for field in fields(file)}, profile=profile)
 
 
-def _merge(base: dict[str, Any], override: Mapping[str, Any], where: str, prefix: str = "") -> None:
+def _merge(base: dict[str, Json], override: Mapping[str, Json], where: str, prefix: str = "") -> None:
     for key, value in override.items():
         if key not in base:
             raise BadInput(f"{where}: a profile sets {prefix + key!r}, which the protocol does not have")
-        if isinstance(value, dict) and isinstance(base[key], dict):
-            _merge(base[key], value, where, f"{prefix}{key}.")
+        own = base[key]
+        if isinstance(value, dict) and isinstance(own, dict):
+            _merge(own, value, where, f"{prefix}{key}.")
         else:
             base[key] = value
 

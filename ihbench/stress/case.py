@@ -54,7 +54,7 @@ class Outcome:
     note: str
     seconds: float
 
-    def row(self) -> dict[str, Any]:
+    def row(self) -> dict[str, object]:
         """As plain data, without the function."""
         case = self.case
         return {

@@ -13,7 +13,7 @@ from ihbench.stress.case import Outcome
 UNITS = {"ulp": "ulp", "relative": "rel", "absolute": "abs", "at most": "over", "words": "words"}
 
 
-def data_of(outcomes: Sequence[Outcome], seconds: float, processor_seconds: float) -> dict[str, Any]:
+def data_of(outcomes: Sequence[Outcome], seconds: float, processor_seconds: float) -> dict[str, object]:
     """{"ok", "seconds", …, "machine", "cases": […]}."""
     from ihbench.clock import machine
 

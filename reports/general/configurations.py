@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from ihbench.config_fields import Values
 from ihbench.record.results import RunResult
 from ihbench.record.schema import value_text
 from ihbench.reports.general.clock import by_machine
@@ -104,7 +105,7 @@ def _rank(value: Any) -> tuple[float, ...] | None:
     return None
 
 
-def _in_force(runs: Sequence[RunResult]) -> dict[str, Any]:
+def _in_force(runs: Sequence[RunResult]) -> Values:
     """Switches that the plan has changed -> value; None where not all runs have the same."""
     first, *others = [run.planned for run in runs]
     names = dict.fromkeys(name for changed in (first, *others) for name in changed)

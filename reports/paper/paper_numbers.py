@@ -142,7 +142,7 @@ def paper_table(name: str, file: Path | None = None) -> PaperTable:
         ) from error
 
 
-def _table(name: str, raw: dict[str, Any], source: str, digits: dict[str, dict[str, int]]) -> PaperTable:
+def _table(name: str, raw: Mapping[str, Any], source: str, digits: Mapping[str, Mapping[str, int]]) -> PaperTable:
     groups = tuple(
         Group(
             columns=tuple(Column(g["name"], key, Digits(**digits[key])) for key in g["metrics"]),
@@ -173,12 +173,12 @@ def _table(name: str, raw: dict[str, Any], source: str, digits: dict[str, dict[s
     return table
 
 
-def _fields(raw: dict[str, Any]) -> dict[str, Any]:
+def _fields(raw: Mapping[str, Any]) -> Mapping[str, Any]:
     """A part of the file as fields of a dataclass: its lists as tuples."""
     return {key: tuple(value) if isinstance(value, list) else value for key, value in raw.items()}
 
 
-def _row(raw: dict[str, Any]) -> PaperRow:
+def _row(raw: Mapping[str, Any]) -> PaperRow:
     own = raw.get("status", "quoted")
     cells = []
     for k, text in enumerate(raw["cells"]):

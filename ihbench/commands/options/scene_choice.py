@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Union, get_args, get_origin, g
 
 import tyro
 
-from ihbench.config_fields import IMAGE_SIZES, Within, flat, has_text, refuse_repeated
+from ihbench.config_fields import IMAGE_SIZES, Values, Within, flat, has_text, refuse_repeated
 from ihbench.errors import BadInput
 from ihbench.scene import protocol as protocol_module
 from ihbench.scene.protocol import CHOICES, Protocol, ProtocolFile
@@ -104,7 +104,7 @@ class ProtocolChanges:
     choices: Choices = NO_CHOICE
     """Every choice of the protocol, as `ihbench protocol show` names it."""
 
-    def changes(self) -> dict[str, Any]:
+    def changes(self) -> Values:
         """Choice -> its other value; of `occlusion.fraction` all, as a tuple. Raises `BadInput` for two of one."""
         out = {name: value for name, value in flat(self.choices).items() if value is not None}
         for name, value in self._short().items():
@@ -113,7 +113,7 @@ class ProtocolChanges:
             out[name] = value
         return out
 
-    def _short(self) -> dict[str, Any]:
+    def _short(self) -> Values:
         given = flat(self)
         return {name: given[field] for name, field in SHORT.items() if given[field] not in (None, ())}
 

@@ -110,7 +110,7 @@ def _scores(preset: Preset, case: Case, background: tuple[float, float, float]) 
     return {identity: score.value for identity, score in found.items()}
 
 
-def _against_oracles(presets: Sequence[Preset], networks: dict[str, Any]) -> Iterator[Comparison]:
+def _against_oracles(presets: Sequence[Preset], networks: dict[str, lpips.Network]) -> Iterator[Comparison]:
     """Every measure of every preset, over every region it has, against its float64 twin."""
     for preset in presets:
         for case in _cases():
@@ -238,7 +238,7 @@ def package_distance(
         return float(package(*images))
 
 
-def _lpips_against_package(networks: dict[str, Any]) -> Iterator[Comparison]:
+def _lpips_against_package(networks: dict[str, lpips.Network]) -> Iterator[Comparison]:
     """Our call path against the package's own on one seeded random trunk. Such a trunk never makes a result."""
     case = person_case(*LIBRARY_SIZE)
     for net, network in networks.items():

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
+from ihbench.config_fields import Values
 from ihbench.runner.ablation import AblationSuite, Comparison, Variant
 
-ONE_LEVEL: dict[str, Any] = {"levels": (128,)}  # the paper does not say which single map its baseline has
-NO_PAINTER: dict[str, Any] = {"inpaint.on": False}
-ONE_FIT: dict[str, Any] = {"one_fit": True}  # what a fit with SSIM and more steps reaches without paintings
+ONE_LEVEL: Values = {"levels": (128,)}  # the paper does not say which single map its baseline has
+NO_PAINTER: Values = {"inpaint.on": False}
+ONE_FIT: Values = {"one_fit": True}  # what a fit with SSIM and more steps reaches without paintings
 # what is left out everywhere, besides what the plan leaves out of a scene
-EVERYTHING: dict[str, Any] = {"cull": False, "crop": False, "inpaint.key_views": 0, "inpaint.always": True}
-NEITHER: dict[str, Any] = {"inpaint.ti": False, "inpaint.sg": False}
+EVERYTHING: Values = {"cull": False, "crop": False, "inpaint.key_views": 0, "inpaint.always": True}
+NEITHER: Values = {"inpaint.ti": False, "inpaint.sg": False}
 
 
 def _paper(psnr: float, ssim: float, lpips: float) -> dict[str, float]:

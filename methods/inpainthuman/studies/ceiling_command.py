@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -65,7 +65,7 @@ def _ceiling(chosen: CeilingOptions) -> int:
         raise BadInput(f"ceiling: runs of one protocol and profile at a time, got {sorted(map(str, groups))}")
     progress, found = Progress(), []
     blocks: list[Block] = []
-    numbers: dict[str, Any] = {}
+    numbers: dict[str, object] = {}
     for result in results:
         shares = tuple(sorted(set(chosen.truth)))
         rows = ceiling(result.folder, shares, chosen.data, chosen.body, chosen.device, progress)
@@ -147,7 +147,7 @@ def _decibels(value: float) -> str:
     return METRICS["psnr"].text(value)
 
 
-def _numbers(result: RunResult, rows: Sequence[CeilingRow]) -> dict[str, Any]:
+def _numbers(result: RunResult, rows: Sequence[CeilingRow]) -> dict[str, object]:
     def plain(value: float) -> float | str | None:
         return None if math.isnan(value) else "inf" if math.isinf(value) else value
 

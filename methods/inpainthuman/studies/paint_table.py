@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +34,7 @@ def paint_scene(
     config: InpaintConfig,
     progress: Progress,
     device: str = "cpu",
-) -> tuple[dict[str, Any], NDArray[np.uint8]]:
+) -> tuple[dict[str, dict[str, float]], NDArray[np.uint8]]:
     """Row -> scores over the scene's hidden pixels, and a picture. Raises `BadInput` when nothing is hidden."""
     from ihbench.methods.inpainthuman.studies.drift import flicker, hidden_scores, identity_drift
 
@@ -55,7 +54,7 @@ def paint_scene(
     asked = [views[k] for k in chosen]
     truth_images = [truths[k].image for k in chosen]
     silhouettes = [truths[k].person for k in chosen]
-    found: dict[str, Any] = {}
+    found: dict[str, dict[str, float]] = {}
     pictures: dict[str, NDArray[np.uint8]] = {}
     for row in rows:
         scored = []
@@ -114,9 +113,9 @@ def _row(images: Sequence[NDArray[np.uint8]], most: int = 10) -> NDArray[np.uint
     return np.concatenate(cells, 1)
 
 
-def summary(scenes: Mapping[str, Mapping[str, Mapping[str, float]]]) -> dict[str, Any]:
+def summary(scenes: Mapping[str, Mapping[str, Mapping[str, float]]]) -> dict[str, dict[str, dict[str, float]]]:
     """Row -> score -> mean over scenes with its interval, and the full method's paired lead in PSNR."""
-    out: dict[str, Any] = {}
+    out: dict[str, dict[str, dict[str, float]]] = {}
     rows = list(next(iter(scenes.values())))
     for row in rows:
         out[row] = {}
@@ -125,12 +124,8 @@ def summary(scenes: Mapping[str, Mapping[str, Mapping[str, float]]]) -> dict[str
             finite = {scene: value for scene, value in values.items() if math.isfinite(value)}
             if finite:
                 interval = mean_interval(finite)
-                out[row][score] = {
-                    "mean": interval.value,
-                    "low": interval.low,
-                    "high": interval.high,
-                    "n": interval.n,
-                }
+                low, high = interval.low, interval.high
+                out[row][score] = {"mean": interval.value, "low": low, "high": high, "n": interval.n}
         if FULL in rows and row != FULL and len(scenes) > 1:
             full = {scene: scores[FULL]["psnr"] for scene, scores in scenes.items()}
             own = {scene: scores[row]["psnr"] for scene, scores in scenes.items()}
@@ -141,7 +136,7 @@ def summary(scenes: Mapping[str, Mapping[str, Mapping[str, float]]]) -> dict[str
     return out
 
 
-def table(result: Mapping[str, Any], title: str) -> list[Block]:
+def table(result: Mapping[str, Mapping[str, Mapping[str, float]]], title: str) -> list[Block]:
     """A row for each painter."""
     head = ("painter", "PSNR ↑ (95 %)", "on the body model ↑", "SSIM ↑", "FLIP ↓", "drift ΔE ↓", "flicker ↓", "s")
     rows = []
