@@ -17,6 +17,7 @@ from ihbench import registry
 from ihbench.commands.options.parse import subcommand
 from ihbench.commands.options.printing import Printing
 from ihbench.commands.options.run_filters import RunFilters
+from ihbench.config_fields import Values
 from ihbench.document.document import Table
 from ihbench.errors import BadInput
 
@@ -110,7 +111,7 @@ def _export(chosen: Export) -> int:
     return 0
 
 
-def _filters(chosen: _Seed) -> dict[str, Any]:
+def _filters(chosen: _Seed) -> Values:
     return {name: value for name in FILTERS if (value := getattr(chosen, name, None)) is not None}
 
 

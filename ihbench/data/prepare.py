@@ -113,10 +113,8 @@ def read_manifest(path: Path) -> Manifest:
     content = atomic.read_json(path)
     wrong = fault(content, Manifest)
     if wrong or not content["made_by"].startswith("ihbench "):
-        raise BadInput(
-            f"{path}: is no manifest of `ihbench prepare` ({wrong or 'another maker'}); name the folder that it has "
-            f"written"
-        )
+        reason = wrong or f"made by {content['made_by'][:60]!r}"
+        raise BadInput(f"{path}: is no manifest of `ihbench prepare` ({reason}); name the folder that it has written")
     return from_json(content, Manifest)
 
 
@@ -280,31 +278,21 @@ def _write(
     atomic.write_json(folder / TEST_VIEWS, list(_test_views(scene, body)))
     protocol, capture = scene.protocol, scene.capture
     fitted_to = "whatever they were fitted to" if scene.hiding.in_scene else "fitted to un-occluded images"
+    files = {
+        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
     manifest = Manifest(
         made_by=f"ihbench {__version__}",
-        protocol=protocol.name,
-        protocol_digest=protocol.digest,
-        profile=protocol.profile,
-        content=protocol.content,
-        dataset=capture.dataset,
-        variant=capture.variant,
-        standin=capture.standin,
-        scene=capture.name,
-        layout=layout,
-        body=body.content_sha(),
-        data=data,
-        body_file=body_file,
+        protocol=protocol.name, protocol_digest=protocol.digest, profile=protocol.profile, content=protocol.content,
+        dataset=capture.dataset, variant=capture.variant, standin=capture.standin, scene=capture.name,
+        layout=layout, body=body.content_sha(), data=data, body_file=body_file,
         occlusion={"rule": scene.hiding.occlusion.rule, **scene.hiding.occlusion.record},
         masks=f"visible person; {UNKNOWN_FOLDER}/ shows what is hidden: person or background, nobody knows",
         body_poses=f"as the data set ships them, {fitted_to}",
-        train=tuple(rows),
-        test=TEST_VIEWS,
-        files={
-            path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
-            for path in sorted(folder.rglob("*"))
-            if path.is_file()
-        },
-    )
+        train=tuple(rows), test=TEST_VIEWS, files=files,
+    )  # fmt: skip
     atomic.write_json(folder / MANIFEST, as_json(manifest))
 
 

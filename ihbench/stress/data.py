@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 import pickle
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -105,7 +105,7 @@ def _regions(scorer: Scorer, *names: str) -> Iterator[list[NDArray[np.int64]]]:
 # Too little to see
 
 
-def _not_opened(words: str, change: dict[str, Any], **of_capture: Any) -> Answer:
+def _not_opened(words: str, change: Mapping[str, object], **of_capture: Any) -> Answer:
     """Why a scene cannot be made of a changed capture under a changed protocol."""
     capture, protocol = replace(person(), **of_capture), replaced(protocol_with(), change)
     return Answer(words_of(BadInput, lambda: open_scene(capture, protocol)), words)
