@@ -8,8 +8,9 @@ import os
 import signal
 import subprocess
 import sys
-from dataclasses import fields, replace
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import pytest
 from hypothesis import given, settings
@@ -20,8 +21,8 @@ from ihbench.errors import BadInput
 from ihbench.files import locks
 from ihbench.files.shape import as_json
 from ihbench.metrics import Identity
-from ihbench.record import store
-from ihbench.record.schema import About, CurvePoint, ScoreLine
+from ihbench.record import schema, store
+from ihbench.record.schema import About, CurvePoint, PresetHead, RunRecord, ScoreLine
 from ihbench.record.store import RunFolder, RunIdentity
 
 IDENTITY = RunIdentity(
@@ -321,3 +322,15 @@ def test_importing_the_store_is_cheap():
     heavy = "{'torch', 'cv2', 'rich', 'numba', 'pandas'}"
     code = f"import sys; import ihbench.metrics, ihbench.record.index; assert not {heavy} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_page_on_the_run_folder_names_every_file_and_field():
+    def names(kind):
+        own = get_type_hints(kind) if is_dataclass(kind) and not hasattr(kind, "parse") else {}
+        parts = own.values() if own else get_args(kind)
+        return {*own}.union(*map(names, parts)) - {"more"}
+
+    page = Path(schema.__file__).parents[1].joinpath("RECORD.md").read_text(encoding="utf-8")
+    stored = names(RunRecord | ScoreLine | PresetHead | CurvePoint) | store.WRITTEN[""]
+    assert [name for name in sorted(stored) if f"`{name}`" not in page] == []
+    assert len(stored) > 80
