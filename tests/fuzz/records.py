@@ -179,7 +179,13 @@ def make_run(runs: Path, method: str, scene: str = "a", seed: int = 0, changed: 
     )  # fmt: skip
     content = {**(told.protocol or {}), "id": "zju_occ", "image": {"size": 64, "background": [1.0, 1.0, 1.0]}}
     told = replace(told, protocol=content)
-    config = {"levels": [16, 64], "grid": {"on": True}, "rate": 1e-3, "keep": ["steps"], "set": [*changed]}
+    config = {
+        "levels": [16, 64],
+        "grid": {"on": True},
+        "rate": 1e-3,
+        "keep": ["steps"],
+        "set": [*map(str, changed.items())],
+    }
     own = identity(scene, method, config=config, seed=seed)
     run = RunFolder.create(runs, own, told)
     ledger = Ledger()
