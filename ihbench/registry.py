@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from difflib import get_close_matches
 from functools import cache
+from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
 from pathlib import Path
@@ -119,19 +120,15 @@ def other_packages() -> dict[str, str]:
 def package_folder(kind: str, name: str) -> Path:
     """The folder of the package that registers a name, found without importing the registered module itself."""
     module = entry_point(kind, name).module
-    for candidate in (module, module.rpartition(".")[0]):
-        spec = find_spec(candidate) if candidate else None
-        if spec and spec.submodule_search_locations:
+    for candidate in filter(None, (module, module.rpartition(".")[0])):
+        if (spec := find_spec(candidate)) and spec.submodule_search_locations:
             return Path(next(iter(spec.submodule_search_locations)))
     raise BadInput(f"{kind} {name!r}: its package {module!r} cannot be found")
 
 
 def room(name: str) -> Path:
     """The folder of one of `ROOMS`."""
-    spec = find_spec(f"ihbench.{name}")
-    if spec is None or not spec.submodule_search_locations:
-        raise BadInput(f"ihbench.{name} cannot be found; install ihbench again")
-    return Path(next(iter(spec.submodule_search_locations)))
+    return Path(import_module(f"ihbench.{name}").__path__[0])
 
 
 def source(kind: str, name: str) -> Path:

@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from typing import Any
 
 REQUESTS = ("SIGTERM", "SIGHUP", "SIGXCPU", "SIGUSR1", "SIGUSR2", "SIGBREAK")  # no system has all of them
+SIGNALS = [getattr(signal, name) for name in ("SIGINT", *REQUESTS) if hasattr(signal, name)]
 GRACE = 5.0  # s that a process without its parent has to record how it ended
 
 
@@ -69,7 +70,7 @@ def interruptible() -> Iterator[None]:
             _asked = KeyboardInterrupt() if number == signal.SIGINT else Terminated(number)
             raise _asked
 
-        for number in (getattr(signal, name) for name in ("SIGINT", *REQUESTS) if hasattr(signal, name)):
+        for number in SIGNALS:
             if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
                 before[number] = signal.signal(number, stop)
     try:
@@ -97,7 +98,7 @@ def undisturbed() -> Iterator[None]:
         def note(number: int, frame: object) -> None:
             came.append((number, frame))
 
-        for number in (getattr(signal, name) for name in ("SIGINT", *REQUESTS) if hasattr(signal, name)):
+        for number in SIGNALS:
             if callable(signal.getsignal(number)):
                 before[number] = signal.signal(number, note)
     ended = False

@@ -15,20 +15,15 @@ from pathlib import Path
 def choose_kernel_cache() -> None:
     """Set NUMBA_CACHE_DIR where numba would find no place: to `IHBENCH_CACHE`, or a private folder for temporary
     files. Call it before numba is imported."""
-    if os.environ.get("NUMBA_CACHE_DIR") or os.access(Path(__file__).parent, os.W_OK) or _may_write(_user_cache()):
+    users = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")) / "numba"
+    if os.environ.get("NUMBA_CACHE_DIR") or os.access(Path(__file__).parent, os.W_OK) or _may_write(users):
         return
     own = os.path.expanduser(os.path.expandvars(os.environ.get("IHBENCH_CACHE", "")))
     if own and _may_write(Path(own)):
         os.environ["NUMBA_CACHE_DIR"] = str(Path(own).absolute() / "kernels")
         return
-    try:
+    with suppress(OSError):  # no place at all: numba will say so
         os.environ["NUMBA_CACHE_DIR"] = str(_private_folder())
-    except OSError:  # no place at all: numba will say so
-        return
-
-
-def _user_cache() -> Path:
-    return Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")) / "numba"
 
 
 def _may_write(folder: Path) -> bool:
@@ -37,9 +32,7 @@ def _may_write(folder: Path) -> bool:
     while not os.path.lexists(folder) and folder != folder.parent:
         folder = folder.parent
     try:
-        with tempfile.TemporaryFile(
-            dir=folder
-        ):  # permissions alone tell nothing about read-only file systems of root
+        with tempfile.TemporaryFile(dir=folder):  # root's permissions do not tell of read-only file systems
             return True
     except OSError:
         return False

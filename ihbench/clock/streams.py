@@ -34,13 +34,8 @@ class Stdout(io.TextIOWrapper):
     used = False  # whether anything has been printed
 
     def __init__(self, plain: io.TextIOWrapper):
-        super().__init__(
-            plain.buffer,
-            plain.encoding,
-            plain.errors,
-            line_buffering=plain.line_buffering,
-            write_through=plain.write_through,
-        )
+        super().__init__(plain.buffer, plain.encoding, plain.errors)
+        self.reconfigure(line_buffering=plain.line_buffering, write_through=plain.write_through)
         self.plain = plain  # would close what both write to when nobody held it
 
     def write(self, text: str, /) -> int:

@@ -27,12 +27,6 @@ OVERLAY_FRAMES = 3
 BODY_LINE, MASK_LINE = (0, 220, 255), (255, 60, 60)  # RGB: the projected body, the mask
 
 
-def protocols_of(dataset: str) -> list[Protocol]:
-    """The registered protocols on a data set, at the profile that reads most."""
-    protocols = (load_protocol(name, "paper") for name in registry.names("protocol"))
-    return [protocol for protocol in protocols if protocol.dataset == dataset]
-
-
 def fitness(capture: Capture, protocol: Protocol) -> str:
     """ "complete", or what a protocol lacks of a capture, in one line."""
     n_frames, n_cameras = capture.n_frames, len(capture.camera_ids)
@@ -100,7 +94,8 @@ def add_fitness(report: CopyReport, root: Path, body: Body | None, named: Path |
         if named is not None:
             raise BadInput(f"--overlays {named}: lies in the data folder, which is never written to; name another")
         no_place = "none: the current folder is in the data folder, never written to; name one with --overlays"
-    protocols = protocols_of(report.dataset)
+    protocols = [load_protocol(name, "paper") for name in registry.names("protocol")]  # at what reads most
+    protocols = [protocol for protocol in protocols if protocol.dataset == report.dataset]
     source = registry.load("dataset", report.dataset)(root)
     for subject in report.subjects:
         try:

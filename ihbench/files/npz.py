@@ -71,8 +71,8 @@ def _array(member: IO[bytes], where: str, largest: int) -> NDArray:
     data = member.read(count * dtype.itemsize)
     if len(data) < count * dtype.itemsize or member.read(1):
         raise BadInput(f"{where}: its header promises {count * dtype.itemsize} bytes, which is not what follows")
-    array = np.frombuffer(data, dtype, count) if count else np.zeros(0, dtype)
-    return array.reshape(shape, order="F" if fortran else "C").astype(dtype.newbyteorder("="))
+    array = np.ndarray(shape, dtype, data, order="F" if fortran else "C")
+    return array.astype(dtype.newbyteorder("="))
 
 
 def _too_large(where: object, size: int, largest: int) -> BadInput:

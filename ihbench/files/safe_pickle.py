@@ -389,8 +389,7 @@ def load_npy(path: str | Path) -> np.ndarray:
                 f"{path}: truncated, its header promises {count * dtype.itemsize} bytes of {dtype} {shape} "
                 f"and {len(data)} follow; copy the file again"
             )
-    array = np.frombuffer(data, dtype, count) if count else np.zeros(0, dtype)
-    return array.reshape(shape, order="F" if fortran else "C").copy(order="K")
+    return np.ndarray(shape, dtype, data, order="F" if fortran else "C").copy(order="K")
 
 
 def read_npy_header(stream: IO[bytes], path: str | Path) -> tuple[tuple[int, ...], bool, np.dtype]:

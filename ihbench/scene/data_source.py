@@ -53,7 +53,9 @@ class DataSource:
         Raises `BadInput` where the capture does not have the views that the protocol asks for.
         """
         if self.is_standin:
-            self.make_standin([scene], progress)
+            standin = registry.load("stand-in", self.protocol.dataset)
+            self.protocol.check_views(scene, standin.n_frames, standin.n_cameras, f"stand-in {scene}")
+            standin.ensure(self.root, STANDIN_SEED, [scene], wanted_frames(self.protocol, standin), progress)
         capture, model = open_capture(self.protocol.dataset, self.root, scene, body)
         where = f"{capture.dataset} {capture.name}"
         self.protocol.check_views(capture.name, capture.n_frames, len(capture.camera_ids), where)
@@ -71,13 +73,6 @@ class DataSource:
             n_frames, camera_ids = capture.n_frames, capture.camera_ids
         self.protocol.check_views(scene, n_frames, len(camera_ids), f"{self.protocol.dataset} {scene}")
         return test_view_keys(self.protocol, scene, n_frames, camera_ids)
-
-    def make_standin(self, scenes: list[str], progress: Progress) -> None:
-        """Write what the protocol needs of these stand-in subjects and is not there yet."""
-        standin = registry.load("stand-in", self.protocol.dataset)
-        for scene in scenes:
-            self.protocol.check_views(scene, standin.n_frames, standin.n_cameras, f"stand-in {scene}")
-        standin.ensure(self.root, STANDIN_SEED, scenes, wanted_frames(self.protocol, standin), progress)
 
     def exists(self, scene: str) -> bool:
         """Whether the capture is on disk (for a stand-in: whether a run has made it before)."""

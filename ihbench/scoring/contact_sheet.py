@@ -62,17 +62,14 @@ def contact_sheet(rows: Sequence[SheetRow], title: str, zoom: int = 1) -> NDArra
         if row.hidden is not None:
             truth[row.hidden] = error[row.hidden] = GREY
         images = (row.training, truth, displayed(row.prediction), error)
-        window = _window(row)
+        windows = _window_of(displayed(row.truth)), _window_of(displayed(row.prediction))
+        window = tuple(slice(min(a.start, b.start), max(a.stop, b.stop)) for a, b in zip(*windows, strict=True))
         cut = [images[0][_window_of(row.training)]] + [image[window] for image in images[1:]]
         cells.append([image.repeat(zoom, 0).repeat(zoom, 1) for image in cut])
     height = max(cell.shape[0] for line in cells for cell in line)
-    width = max(cell.shape[1] for line in cells for cell in line)
-    width = max(width, 110)
-    sheet = Image.new(
-        "RGB",
-        (len(COLUMNS) * (width + PAD) + PAD, 2 * LABEL + len(cells) * (height + LABEL + PAD) + PAD),
-        (GREY, GREY, GREY),
-    )
+    width = max(110, *(cell.shape[1] for line in cells for cell in line))
+    extent = len(COLUMNS) * (width + PAD) + PAD, 2 * LABEL + len(cells) * (height + LABEL + PAD) + PAD
+    sheet = Image.new("RGB", extent, (GREY, GREY, GREY))
     draw = ImageDraw.Draw(sheet)
     draw.text((PAD, 3), title, fill=(255, 255, 255))
     for c, name in enumerate(COLUMNS):
@@ -84,13 +81,6 @@ def contact_sheet(rows: Sequence[SheetRow], title: str, zoom: int = 1) -> NDArra
             x = PAD + c * (width + PAD) + (width - cell.shape[1]) // 2
             sheet.paste(Image.fromarray(np.ascontiguousarray(cell)), (x, y + LABEL))
     return np.asarray(sheet)
-
-
-def _window(row: SheetRow) -> tuple[slice, slice]:
-    truth, prediction = _window_of(displayed(row.truth)), _window_of(displayed(row.prediction))
-    return tuple(  # type: ignore[return-value]
-        slice(min(a.start, b.start), max(a.stop, b.stop)) for a, b in zip(truth, prediction, strict=True)
-    )
 
 
 def _window_of(image: NDArray[np.uint8], margin: int = 4) -> tuple[slice, slice]:
