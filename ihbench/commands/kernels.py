@@ -32,10 +32,10 @@ def main(argv: list[str]) -> int:
     from ihbench.kernels.table import blocks_of, run_kernels
 
     rows = run_kernels(chosen.kernel, chosen.repeats)
-    about = asdict(machine.identity())
-    chosen.show({"machine": about, "rows": rows}, blocks_of(about, rows))
+    here = machine.identity()
+    chosen.show({"machine": asdict(here), "rows": [asdict(row) for row in rows]}, blocks_of(here, rows))
     if chosen.figure is not None:
         from ihbench.kernels.figure import draw
 
-        print(f"diagram: {draw(rows, about, chosen.figure)}, with the same name .svg and .csv", file=sys.stderr)
+        print(f"diagram: {draw(rows, here, chosen.figure)}, with the same name .svg and .csv", file=sys.stderr)
     return 0

@@ -5,16 +5,35 @@ from __future__ import annotations
 import ctypes
 import time
 from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
 from ihbench.clock import machine
 
-Row = dict[str, Any]
 UNSTABLE = 0.25  # a spread above this share of the median is marked
 
 Sample = tuple[float, float | None]  # ms forward, ms backward
+
+
+@dataclass(frozen=True)
+class Row:
+    """What one back end took for one case, and how far off it was."""
+
+    kernel: str
+    case: str
+    backend: str
+    repeats: int
+    unstable: bool
+    forward_ms: float  # median
+    forward_iqr_ms: float
+    backward_ms: float | None  # None where there is no backward pass
+    backward_iqr_ms: float | None
+    peak_mib: float | None  # that the work needs beside its input
+    value_error: float | None  # against the twin
+    gradient_error: float | None
+    ratio: float = 1.0  # forward time over that of the first back end of its case
+    knob: str = ""  # what a case's rows differ in, where that is a setting
 
 
 def timed(step: Callable[[], object]) -> Sample:
@@ -36,20 +55,6 @@ def interleave(steps: dict[str, Callable[[], Sample]], repeats: int, warm_up: in
     return timings
 
 
-def summary(samples: list[Sample]) -> Row:
-    """Median and interquartile range of forward and backward."""
-    row: Row = {"repeats": len(samples), "unstable": False}
-    for k, name in enumerate(("forward", "backward")):
-        values = [sample[k] for sample in samples]
-        if None in values:
-            row |= {f"{name}_ms": None, f"{name}_iqr_ms": None}
-            continue
-        low, median, high = np.percentile(np.array(values, dtype=np.float64), [25, 50, 75])
-        row |= {f"{name}_ms": float(median), f"{name}_iqr_ms": float(high - low)}
-        row["unstable"] |= bool(high - low > UNSTABLE * median)
-    return row
-
-
 def row_of(
     kernel: str,
     case: str,
@@ -58,12 +63,25 @@ def row_of(
     memory: float | None,  # MiB
     error: float | None,
     gradient_error: float | None = None,
-    **more: str,
+    knob: str = "",
 ) -> Row:
-    """A row of the table."""
-    errors = {"value_error": error, "gradient_error": gradient_error}
-    of = {"kernel": kernel, "case": case, "backend": backend, **more}
-    return {**of, **summary(samples), "peak_mib": memory, **errors}
+    """A row of the table: median and interquartile range of forward and backward."""
+    times: list[float | None] = []
+    unstable = False
+    for values in zip(*samples, strict=True):
+        if None in values:
+            times += [None, None]
+            continue
+        low, median, high = np.percentile(np.array(values, dtype=np.float64), [25, 50, 75])
+        times += [float(median), float(high - low)]
+        unstable |= bool(high - low > UNSTABLE * median)
+    forward, forward_iqr, backward, backward_iqr = times
+    assert forward is not None
+    assert forward_iqr is not None
+    return Row(
+        kernel, case, backend, len(samples), unstable, forward, forward_iqr, backward, backward_iqr, memory, error,
+        gradient_error, knob=knob,
+    )  # fmt: skip
 
 
 def peak_mib(step: Callable[[], object]) -> float | None:

@@ -7,8 +7,9 @@ number of repetitions to table rows.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
-from ihbench.clock import machine
+from ihbench.clock.machine import BUSY, Machine
 from ihbench.document.document import Block, Paragraph, Table
 from ihbench.errors import BadInput
 from ihbench.kernels.measuring import UNSTABLE, Row
@@ -27,10 +28,6 @@ REPEATS = 15
 def run_kernels(names: Sequence[str] | None = None, repeats: int = REPEATS) -> list[Row]:
     """Measure the kernels called `names` (all of them by default); returns the rows.
 
-    A row has kernel, case, backend, the median and the interquartile range of the timings in ms (None where the
-    kernel has no backward pass), the memory the work needs beside its input in MiB, the errors against the twin,
-    `unstable`, and `ratio`, its forward time over that of the first back end of its case.
-
     Raises BadInput for an unknown name or fewer than one repetition.
     """
     of_methods = {name: (spec, kernel) for spec in usable_specs() for name, kernel in spec.kernels.items()}
@@ -40,13 +37,13 @@ def run_kernels(names: Sequence[str] | None = None, repeats: int = REPEATS) -> l
         raise BadInput(f"kernel {unknown[0]!r}: expected one of {', '.join(sorted(known))}")
     if repeats < 1:
         raise BadInput(f"kernel repetitions: expected at least 1, got {repeats}")
-    rows = []
+    rows: list[Row] = []
     for name in names or known:
         rows += (KERNELS[name] if name in KERNELS else of_methods[name][0].load(of_methods[name][1]))(repeats)
     first: dict[tuple[str, str], float] = {}
     for row in rows:
-        row["ratio"] = row["forward_ms"] / first.setdefault((row["kernel"], row["case"]), row["forward_ms"])
-    return rows
+        first.setdefault((row.kernel, row.case), row.forward_ms)
+    return [replace(row, ratio=row.forward_ms / first[row.kernel, row.case]) for row in rows]
 
 
 KERNELS: dict[str, Callable[[int], list[Row]]] = {
@@ -63,24 +60,22 @@ KERNELS: dict[str, Callable[[int], list[Row]]] = {
 }
 
 
-def blocks_of(about: Row, rows: Sequence[Row]) -> list[Block]:
+def blocks_of(here: Machine, rows: Sequence[Row]) -> list[Block]:
     """The rows as a table, the machine, and what the numbers are."""
     cells = []
     for row in rows:
-        forward, backward = (
-            "–" if row[f"{k}_ms"] is None else f"{_digits(row[f'{k}_ms'])}±{_digits(row[f'{k}_iqr_ms'] / 2)}"
-            for k in ("forward", "backward")
-        )
-        memory = "–" if row["peak_mib"] is None else f"{row['peak_mib']:.0f}"
-        errors = ("–" if row[k] is None else f"{row[k]:.0e}" for k in ("value_error", "gradient_error"))
-        note = "unstable" if row["unstable"] else ""
-        of = row["kernel"], row["case"], row["backend"]
-        cells.append((*of, forward, f"{row['ratio']:.2f}", backward, memory, *errors, note))
+        forward = _spread(row.forward_ms, row.forward_iqr_ms)
+        backward = "–" if row.backward_ms is None else _spread(row.backward_ms, row.backward_iqr_ms or 0.0)
+        memory = "–" if row.peak_mib is None else f"{row.peak_mib:.0f}"
+        errors = ("–" if error is None else f"{error:.0e}" for error in (row.value_error, row.gradient_error))
+        note = "unstable" if row.unstable else ""
+        of = row.kernel, row.case, row.backend
+        cells.append((*of, forward, f"{row.ratio:.2f}", backward, memory, *errors, note))
     head = ("kernel", "case", "back end", "fwd ms", "ratio", "bwd ms", "MiB", "error", "grad err", "note")
-    gpu = f", {about['gpu']}" if about["gpu"] else ""
-    lines = [f"{about['cpu']}, {about['torch_threads']} threads{gpu}, load average {about['load_average']}"]
-    if busy(about):
-        lines.append(f"Other work is running here (load above {machine.BUSY} per core): these times are unstable.")
+    gpu = f", {here.gpu}" if here.gpu else ""
+    lines = [f"{here.cpu}, {here.torch_threads} threads{gpu}, load average {here.load_average}"]
+    if busy(here):
+        lines.append(f"Other work is running here (load above {BUSY} per core): these times are unstable.")
     lines.append(
         f"Median ± half the interquartile range; unstable: the range exceeds {UNSTABLE:.0%} of the median; ratio: of"
         " the forward time to that of the case's first row. Errors of splats are against the float64 twin in a window"
@@ -92,9 +87,13 @@ def blocks_of(about: Row, rows: Sequence[Row]) -> list[Block]:
     return [Table(head, tuple(cells), left=3), *map(Paragraph, lines)]
 
 
-def busy(about: Row) -> bool:
+def busy(here: Machine) -> bool:
     """Whether the load at the end says that other work was in the way."""
-    return bool(about["load_average"]) and about["load_average"][0] > machine.BUSY * about["cores_usable"]
+    return bool(here.load_average) and here.load_average[0] > BUSY * (here.cores_usable or 1)
+
+
+def _spread(median: float, iqr: float) -> str:
+    return f"{_digits(median)}±{_digits(iqr / 2)}"
 
 
 def _digits(ms: float) -> str:

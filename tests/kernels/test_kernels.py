@@ -3,18 +3,20 @@
 import csv
 import json
 import math
-from dataclasses import asdict, replace
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from ihbench.body import load_body, position_map, texel_table
+from ihbench.clock import machine
+from ihbench.clock.machine import Machine
 from ihbench.document import diagram
 from ihbench.document.document import write
 from ihbench.errors import BadInput
 from ihbench.kernels import figure, metrics, position_maps, scoring, skinning, splats, table, zbuffers
-from ihbench.kernels.measuring import interleave, peak_mib, summary
+from ihbench.kernels.measuring import Row, interleave, peak_mib, row_of
 from ihbench.render.splat import render_gaussians
 
 
@@ -27,12 +29,12 @@ def small(monkeypatch):
 
 
 def shown(rows):
-    return write(table.blocks_of(table.machine.identity(), rows), "terminal")
+    return write(table.blocks_of(machine.identity(), rows), "terminal")
 
 
 def test_every_back_end_gets_a_row(small):
     rows = table.run_kernels(["splat", "zbuffer"], repeats=2)
-    found = [(r["kernel"], r["case"], r["backend"]) for r in rows]
+    found = [(r.kernel, r.case, r.backend) for r in rows]
     assert found == [
         ("splat", "300@48", "numba"),
         ("splat", "300@48", "reference"),
@@ -41,11 +43,11 @@ def test_every_back_end_gets_a_row(small):
         ("zbuffer", "tiny", "numba"),
     ]
     for row in rows:
-        assert row["forward_ms"] > 0
-        assert row["forward_iqr_ms"] >= 0
-        assert (row["backward_ms"] is None) == (row["kernel"] == "zbuffer")
-        assert row["value_error"] < 1e-5
-        assert row["gradient_error"] is None or row["gradient_error"] < 1e-4
+        assert row.forward_ms > 0
+        assert row.forward_iqr_ms >= 0
+        assert (row.backward_ms is None) == (row.kernel == "zbuffer")
+        assert row.value_error < 1e-5
+        assert row.gradient_error is None or row.gradient_error < 1e-4
     out = shown(rows)
     assert "numba" in out
     assert "threads" in out
@@ -87,13 +89,13 @@ def test_the_steps_are_interleaved_after_a_warm_up():
 
 
 def test_the_spread_decides_what_is_unstable():
-    calm = summary([(v, 1.0) for v in (9.9, 10.0, 10.0, 10.1, 40.0)])
-    assert (calm["forward_ms"], calm["unstable"]) == (10.0, False)
-    assert calm["forward_iqr_ms"] == pytest.approx(0.1)
-    shaky = summary([(1.0, v) for v in (8.0, 9.0, 10.0, 12.0, 15.0)])
-    assert shaky["unstable"]
-    assert shaky["backward_iqr_ms"] == pytest.approx(3.0)
-    assert summary([(1.0, None)])["backward_ms"] is None
+    calm = row_of("k", "c", "b", [(v, 1.0) for v in (9.9, 10.0, 10.0, 10.1, 40.0)], None, None)
+    assert (calm.forward_ms, calm.unstable) == (10.0, False)
+    assert calm.forward_iqr_ms == pytest.approx(0.1)
+    shaky = row_of("k", "c", "b", [(1.0, v) for v in (8.0, 9.0, 10.0, 12.0, 15.0)], None, None)
+    assert shaky.unstable
+    assert shaky.backward_iqr_ms == pytest.approx(3.0)
+    assert row_of("k", "c", "b", [(1.0, None)], None, None).backward_ms is None
 
 
 def test_peak_memory_is_what_the_step_needs():
@@ -106,11 +108,11 @@ def test_metric_rows_hold_the_error_of_every_dtype_and_library(capsys, monkeypat
     rows = metrics.ssim_rows(1, size=32) + metrics.flip_rows(1, size=32) + metrics.frame_rows(1, size=64)
     errors = {}
     for row in rows:
-        kind = row["backend"].rsplit(" ", 1)[-1] if " " in row["backend"] else "ours"
-        errors[kind] = max(errors.get(kind, 0.0), row["value_error"])
-        assert row["forward_ms"] > 0
-    assert {row["kernel"] for row in rows} == {"ssim", "flip", "frame"}
-    assert {"u8", "f16", "f32", "f64"} <= {row["backend"] for row in rows}
+        kind = row.backend.rsplit(" ", 1)[-1] if " " in row.backend else "ours"
+        errors[kind] = max(errors.get(kind, 0.0), row.value_error)
+        assert row.forward_ms > 0
+    assert {row.kernel for row in rows} == {"ssim", "flip", "frame"}
+    assert {"u8", "f16", "f32", "f64"} <= {row.backend for row in rows}
     assert errors["ours"] < 1e-12
     assert 0 < errors["f32"] < 2e-5  # our loss in torch and, where installed, torchmetrics, kornia and flip-evaluator
 
@@ -118,38 +120,38 @@ def test_metric_rows_hold_the_error_of_every_dtype_and_library(capsys, monkeypat
 def test_lpips_whole_tiled_and_cropped_is_the_packages_up_to_single_precision(monkeypatch):
     monkeypatch.setattr(metrics, "LPIPS_ERROR_SIZE", 192)
     rows = metrics.lpips_rows(1, size=64, nets=["alex"])
-    assert [r["backend"] for r in rows] == [
+    assert [r.backend for r in rows] == [
         "ours f32", "ours f32, tiled", "lpips package f32", "ours f32, crop", "lpips package f32, crop"
     ]  # fmt: skip
-    assert all("random trunk" in r["case"] for r in rows)  # the tests' machine has no weights, and it is said
-    assert all(0 <= r["value_error"] < 1e-6 for r in rows)
-    assert any(r["value_error"] > 0 for r in rows)
+    assert all("random trunk" in r.case for r in rows)  # the tests' machine has no weights, and it is said
+    assert all(0 <= r.value_error < 1e-6 for r in rows)
+    assert any(r.value_error > 0 for r in rows)
 
 
 def test_too_small_a_halo_would_show_in_the_tiled_row(monkeypatch):
     monkeypatch.setattr("ihbench.metrics.lpips.HALO", 16)
     monkeypatch.setattr(metrics, "LPIPS_ERROR_SIZE", 192)
-    (tiled,) = [r for r in metrics.lpips_rows(1, size=64, nets=["alex"]) if r["backend"].endswith("tiled")]
-    assert tiled["value_error"] > 1e-6
+    (tiled,) = [r for r in metrics.lpips_rows(1, size=64, nets=["alex"]) if r.backend.endswith("tiled")]
+    assert tiled.value_error > 1e-6
 
 
 def test_skinning_loses_digits_with_its_precision_and_only_then():
-    rows = {r["backend"]: r for r in skinning.lbs_rows(1, (("few", 16),))}
+    rows = {r.backend: r for r in skinning.lbs_rows(1, (("few", 16),))}
     assert list(rows) == ["numpy f64", "torch f64", "torch f32", "torch f16"]
-    assert rows["torch f64"]["value_error"] < 1e-14
-    assert 1e-9 < rows["torch f32"]["value_error"] < 1e-5
-    assert 1e-4 < rows["torch f16"]["value_error"] < 0.05
-    assert 0 < rows["torch f32"]["gradient_error"] < 1e-5 < rows["torch f16"]["gradient_error"] < 0.05
-    assert rows["numpy f64"]["backward_ms"] is None
+    assert rows["torch f64"].value_error < 1e-14
+    assert 1e-9 < rows["torch f32"].value_error < 1e-5
+    assert 1e-4 < rows["torch f16"].value_error < 0.05
+    assert 0 < rows["torch f32"].gradient_error < 1e-5 < rows["torch f16"].gradient_error < 0.05
+    assert rows["numpy f64"].backward_ms is None
 
 
 def test_position_maps_are_held_against_a_twin_that_asks_every_face(monkeypatch):
     rows = position_maps.position_map_rows(1, (12,))
-    errors = {r["backend"]: r["value_error"] for r in rows}
+    errors = {r.backend: r.value_error for r in rows}
     assert errors["table anew f64"] < 1e-12
     assert 0 < errors["cached table f32"] < 1e-6
     monkeypatch.setattr(position_maps, "position_map", lambda v, body, r: position_map(v[::-1], body, r))
-    wrong = {r["backend"]: r["value_error"] for r in position_maps.position_map_rows(1, (12,))}
+    wrong = {r.backend: r.value_error for r in position_maps.position_map_rows(1, (12,))}
     assert wrong["cached table f32"] > 0.1
 
 
@@ -163,9 +165,7 @@ def test_the_twin_of_a_coarser_look_is_the_finer_one_at_every_nth_texel():
 
 
 def a_row(**changes):
-    row = {"kernel": "k", "case": "c", "backend": "b", "forward_ms": 1.0, "forward_iqr_ms": 0.1, "unstable": False,
-           "value_error": 1e-6, "ratio": 1.0}  # fmt: skip
-    return row | changes
+    return replace(Row("k", "c", "b", 1, False, 1.0, 0.1, None, None, None, 1e-6, None), **changes)
 
 
 def test_the_diagram_shows_every_row_with_an_error_and_the_csv_has_all(tmp_path):
@@ -176,8 +176,7 @@ def test_the_diagram_shows_every_row_with_an_error_and_the_csv_has_all(tmp_path)
         a_row(kernel="untimed", value_error=None),
         *(a_row(kernel="sampler", backend=f"{n} steps", forward_ms=float(n), knob="steps") for n in (1, 4)),
     ]
-    about = {"cpu": "p", "torch_threads": 1, "gpu": None, "load_average": [0.1], "cores_usable": 2}
-    png = figure.draw(rows, about, tmp_path)
+    png = figure.draw(rows, Machine(cpu="p", torch_threads=1, load_average=(0.1,) * 3, cores_usable=2), tmp_path)
     assert png.stat().st_size > 10_000
     svg = png.with_suffix(".svg").read_text()
     for shown in ("b", "exact", "1 steps", "4 steps", "sampler"):
@@ -185,14 +184,13 @@ def test_the_diagram_shows_every_row_with_an_error_and_the_csv_has_all(tmp_path)
     assert ">wrong<" not in svg
     assert ">untimed<" not in svg
     found = list(csv.DictReader(png.with_suffix(".csv").open()))
-    assert [r["kernel"] for r in found] == [r["kernel"] for r in rows]
-    assert [float(r["value_error"] or "nan") for r in found[:3]] == [1e-6, 0.0, math.inf]
+    assert [r.kernel for r in found] == [r.kernel for r in rows]
+    assert [float(r.value_error or "nan") for r in found[:3]] == [1e-6, 0.0, math.inf]
     assert found[0]["machine"].startswith("p, 1 threads")
 
 
 def test_a_table_with_nothing_to_draw_is_still_written(tmp_path):
-    about = {"cpu": "p", "torch_threads": 1, "gpu": None, "load_average": None, "cores_usable": 2}
-    assert figure.draw([a_row(value_error=None)], about, tmp_path).exists()
+    assert figure.draw([a_row(value_error=None)], Machine(cpu="p", cores_usable=2), tmp_path).exists()
     assert diagram.round_ticks(1, 10)
 
 
@@ -201,20 +199,20 @@ def test_a_kernel_that_a_method_registers_is_measured_beside_the_benchs_own(monk
     spec = SimpleNamespace(kernels={"theirs": "module:rows"}, load=lambda where: lambda repeats: [theirs])
     monkeypatch.setattr(table, "usable_specs", lambda: [spec])
     (row,) = table.run_kernels(["theirs"], repeats=1)
-    assert row["kernel"] == "theirs"
+    assert row.kernel == "theirs"
     assert "theirs" in shown([row])
 
 
 @pytest.mark.parametrize(("load", "said"), [(9.0, True), (0.5, False)])
 def test_a_busy_machine_is_named_below_the_table(load, said):
-    about = asdict(replace(table.machine.identity(), load_average=(load, 0.0, 0.0), cores_usable=2))
-    assert ("times are unstable" in write(table.blocks_of(about, []), "terminal")) == said
+    here = Machine(load_average=(load, 0.0, 0.0), cores_usable=2)
+    assert ("times are unstable" in write(table.blocks_of(here, []), "terminal")) == said
 
 
 def test_scoring_is_timed_on_a_stand_in(bench, monkeypatch):
     monkeypatch.setattr(scoring, "PROTOCOL", str(bench.protocol))
     with bench.in_its_world():
         rows = scoring.score_rows(1, views=3, profile="quick")
-    assert [r["backend"] for r in rows] == ["psnr+ssim", "psnr+ssim+flip"]
-    assert all(r["forward_ms"] > 0 for r in rows)
+    assert [r.backend for r in rows] == ["psnr+ssim", "psnr+ssim+flip"]
+    assert all(r.forward_ms > 0 for r in rows)
     assert rows[0]["case"].startswith("3 views@")
