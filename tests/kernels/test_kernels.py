@@ -184,8 +184,8 @@ def test_the_diagram_shows_every_row_with_an_error_and_the_csv_has_all(tmp_path)
     assert ">wrong<" not in svg
     assert ">untimed<" not in svg
     found = list(csv.DictReader(png.with_suffix(".csv").open()))
-    assert [r.kernel for r in found] == [r.kernel for r in rows]
-    assert [float(r.value_error or "nan") for r in found[:3]] == [1e-6, 0.0, math.inf]
+    assert [r["kernel"] for r in found] == [r.kernel for r in rows]
+    assert [float(r["value_error"] or "nan") for r in found[:3]] == [1e-6, 0.0, math.inf]
     assert found[0]["machine"].startswith("p, 1 threads")
 
 
