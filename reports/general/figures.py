@@ -33,6 +33,7 @@ from ihbench.reports.general.run_time import (
 )
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -98,8 +99,8 @@ def _work_precision(
     if not found:
         return []
     drawn, axes = diagram.figure(len(found), width=5.0, height=5.2)
-    rows: list[dict[str, Any]] = []
-    handles: dict[str, Any] = {}
+    rows: list[dict[str, object]] = []
+    handles: dict[str, Artist] = {}
     labels: list[tuple[Axes, list[diagram.Label], list[list[tuple[float, float]]]]] = []
     for panel, (identity, points) in zip(axes, found.items(), strict=True):
         front = pareto_set([p.seconds.value for p in points], [p.error.value for p in points])
@@ -125,7 +126,7 @@ def _work_precision(
 
 
 def _points(
-    panel: Axes, points: Sequence[WorkPoint], handles: dict[str, Any]
+    panel: Axes, points: Sequence[WorkPoint], handles: dict[str, Artist]
 ) -> tuple[list[diagram.Label], list[list[tuple[float, float]]]]:
     """Draw the configurations, sweeps as lines; gives the texts that belong beside them, and the lines."""
     place = {id(p.configuration): p for p in points}
@@ -186,7 +187,7 @@ def _shown(intervals: Sequence[Interval]) -> list[float]:
     return [*values, *(min(max(end, low), high) for end in ends)]
 
 
-def _csv_row(p: WorkPoint, identity: Identity, on_front: bool, scenes: Sequence[str]) -> dict[str, Any]:
+def _csv_row(p: WorkPoint, identity: Identity, on_front: bool, scenes: Sequence[str]) -> dict[str, object]:
     c = p.configuration
     runs = [run for run in c.runs if run.scene in scenes]
     return {
@@ -232,8 +233,8 @@ def _quality_time(
         return []
     views = standing(run for c in configs for run in c.runs)
     drawn, axes = diagram.figure(len(regions), len(metrics), width=4.2, height=3.8)
-    rows: list[dict[str, Any]] = []
-    handles: dict[str, Any] = {}
+    rows: list[dict[str, object]] = []
+    handles: dict[str, Artist] = {}
     for k, panel in enumerate(axes):
         metric, region = metrics[k // len(regions)], regions[k % len(regions)]
         identity = panels.get((metric, region))
@@ -257,7 +258,7 @@ def _quality_time(
 
 
 def _curve_panel(
-    panel: Axes, configs: Sequence[Configuration], identity: Identity, handles: dict[str, Any]
+    panel: Axes, configs: Sequence[Configuration], identity: Identity, handles: dict[str, Artist]
 ) -> list[dict[str, Any]]:
     """Draw every configuration's checkpoints and mean curve; gives what was drawn as rows."""
     metric = identity.metric
@@ -332,7 +333,7 @@ def _name_axes(panel: Axes, identity: Identity, below: str, where: str = "") -> 
         beside.spines["right"].set_visible(True)
 
 
-def _finish(drawn: Figure, handles: dict[str, Any], title: str, about: str) -> None:
+def _finish(drawn: Figure, handles: dict[str, Artist], title: str, about: str) -> None:
     """Title on top, legend below, outside the axes."""
     drawn.suptitle(diagram.words(f"{title}\n{about}"), fontsize=11)
     texts = [diagram.words(fill(label, LEGEND_WIDTH)) for label in handles]
