@@ -31,18 +31,18 @@ class NamePattern:
         """
         parts: list[str | tuple[str, int]] = []
         at = 0
-        for found in PART.finditer(text):
-            parts.append(text[at : found.start()])
-            at, name = found.end(), found["name"]
+        for match in PART.finditer(text):
+            parts.append(text[at : match.start()])
+            at, name = match.end(), match["name"]
             if name is None:
-                if len(found[0]) == 1:
-                    raise BadInput(f"--pattern {text!r}: a {found[0]} alone; expected {{{words[0]}}}, or two of them")
-                parts.append(found[0][0])
+                if len(match[0]) == 1:
+                    raise BadInput(f"--pattern {text!r}: a {match[0]} alone; expected {{{words[0]}}}, or two of them")
+                parts.append(match[0][0])
                 continue
             if name not in (*numbers, *words):
                 known = registry.nearest(name, [*words, *numbers])
                 raise BadInput(f"--pattern {text!r}: no placeholder {{{name}}}; {known}")
-            parts.append((name, _width(text, name, found["format"] or "", name in numbers)))
+            parts.append((name, _width(text, name, match["format"] or "", name in numbers)))
         if not text:
             raise BadInput("--pattern '': expected a pattern such as {camera}/{frame:06d}.png")
         return cls(text, (*parts, text[at:]))

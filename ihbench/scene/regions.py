@@ -62,7 +62,7 @@ class SurfaceMap:
             "hidden": lambda: surface == HIDDEN,
             "never_seen": lambda: surface == NEVER_SEEN,
         }
-        found = {}
+        masks = {}
         for name in names:
             padding = re.fullmatch(r"box\+([0-9.]+)", name)
             if padding:
@@ -71,8 +71,8 @@ class SurfaceMap:
                 region = every[name]()
             else:
                 raise ValueError(f"region {name!r}: expected one of {', '.join(every)}, or box+METRES")
-            found[name] = region if view.hidden is None else region & ~view.hidden
-        return found
+            masks[name] = region if view.hidden is None else region & ~view.hidden
+        return masks
 
     def labels_in(
         self,

@@ -79,9 +79,9 @@ def representatives(
         before = cost
         for place in range(count):
             others = chosen[:place] + chosen[place + 1 :]
-            found, k = best(others)
-            if found < cost * (1 - 1e-9):
-                chosen[place], cost = k, found
+            new_cost, k = best(others)
+            if new_cost < cost * (1 - 1e-9):
+                chosen[place], cost = k, new_cost
         if cost == before:
             break
     return sorted(chosen)

@@ -55,11 +55,11 @@ class Predictions:
     @property
     def digest(self) -> str:
         """Hash of the images' bytes and what they stand for: other images make another run."""
-        found = hashlib.sha256(b"" if self.alpha == ALPHAS[0] else self.alpha.encode())
+        digest = hashlib.sha256(b"" if self.alpha == ALPHAS[0] else self.alpha.encode())
         for key, path in self.files.items():
-            found.update(f"{key.name}\n".encode())
-            found.update(hashlib.sha256(path.read_bytes()).digest())
-        return found.hexdigest()[:16]
+            digest.update(f"{key.name}\n".encode())
+            digest.update(hashlib.sha256(path.read_bytes()).digest())
+        return digest.hexdigest()[:16]
 
     def read(self, key: TestViewKey, background: Color) -> NDArray | None:
         """The image of one view, [H, W, 3]; None where there is none. See `read_image`."""
@@ -68,11 +68,11 @@ class Predictions:
 
     def notes(self) -> list[str]:
         """What a reader of the scores must know, a line each."""
-        found = []
+        lines = []
         if self.missing:
-            found.append(f"{len(self.missing)} of {len(self.missing) + len(self.files)} predictions are missing")
+            lines.append(f"{len(self.missing)} of {len(self.missing) + len(self.files)} predictions are missing")
         if self.surplus:
-            found.append(f"{len(self.surplus)} image files in the folder match no test view")
+            lines.append(f"{len(self.surplus)} image files in the folder match no test view")
         headers = [_header(path) for path in self.files.values() if path.suffix.lower() != ".npy"]
         for what, number in (
             ("are JPEG or the like: compression error counts as the method's", sum(h.lossy for h in headers)),
@@ -80,10 +80,10 @@ class Predictions:
             ("have a palette, 256 colours at most", sum(h.palette for h in headers)),
         ):
             if number:
-                found.append(f"{number} predictions {what}")
+                lines.append(f"{number} predictions {what}")
         if self.alpha != ALPHAS[0]:
-            found.append(f"colours of transparent pixels are {self.alpha}")
-        return found
+            lines.append(f"colours of transparent pixels are {self.alpha}")
+        return lines
 
 
 def find_predictions(

@@ -76,9 +76,9 @@ class Scorer:
 
         Raises `BadInput` for an unknown preset.
         """
-        found = tuple(find_preset(name) for name in presets or scene.protocol.metrics.presets)
+        named = tuple(find_preset(name) for name in presets or scene.protocol.metrics.presets)
         seen = scene.training.sightings[FINE]
-        return cls(scene, SurfaceMap.build(scene.capture.model, seen.texels, seen.visibility), found)
+        return cls(scene, SurfaceMap.build(scene.capture.model, seen.texels, seen.visibility), named)
 
     @cached_property
     def withheld(self) -> dict[str, str]:
