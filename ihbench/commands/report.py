@@ -14,7 +14,7 @@ import tyro
 
 from ihbench import registry
 from ihbench.commands.options.parse import options
-from ihbench.commands.options.run_filters import RunFilters
+from ihbench.commands.options.run_filters import RowOptions, RunFilters
 from ihbench.errors import BadInput, visible
 from ihbench.files import atomic
 from ihbench.record import outputs
@@ -26,7 +26,7 @@ SHOWN = 20  # folders left out that are named on stderr
 
 
 @dataclass(frozen=True)
-class ReportOptions(RunFilters):
+class ReportOptions(RunFilters, RowOptions):
     run: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
     """Run folders; none means every run under --runs."""
     preset: tuple[str, ...] = ()
@@ -45,15 +45,10 @@ class ReportOptions(RunFilters):
     """Folder for diagrams of error against run time: PNG, SVG, and their numbers as CSV."""
     target: tuple[str, ...] = ()
     """Qualities whose time is asked for, as psnr=25, flip=0.15 or psnr/hidden=20; without them round ones."""
-    rows: tuple[str, ...] = ()
-    """Only these rows, in this order: names as in the tables, bounds such as truth, or a method, which stands for all
-    of its rows unless one has just that name."""
     metrics: tuple[str, ...] = ()
     """Only these metrics, as psnr or flip."""
     regions: tuple[str, ...] = ()
     """Only these regions, as body or hidden."""
-    names: tuple[str, ...] = ()
-    """Other names for rows, OLD=NEW."""
     fragment: bool = False
     """Only the tables of scores, without a document around them; in LaTeX the tabular alone, for \\input."""
     out: Path | None = None

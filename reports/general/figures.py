@@ -22,6 +22,7 @@ from ihbench.record.schema import plain_name
 from ihbench.reports.general.configurations import Configuration, configurations, short_value, sweeps
 from ihbench.reports.general.run_time import (
     LEVEL,
+    ON_THE_CURVE,
     WorkPoint,
     comparable,
     curve_identities,
@@ -90,8 +91,7 @@ def _work_precision(
     configs, scenes = comparable(configs)
     found: dict[Identity, list[WorkPoint]] = {}
     for i in dict.fromkeys(i for c in configs for run in c.runs for i in run.own):
-        parsed = i
-        if parsed.region != headline or parsed.metric not in METRICS or len(found) == DRAWN:
+        if i.region != headline or i.metric not in METRICS or len(found) == DRAWN:
             continue
         points = [p for p in work_points(configs, i, scenes) if p.seconds.value > 0 and p.error.value > 0]
         if points:
@@ -217,19 +217,10 @@ def _csv_row(p: WorkPoint, identity: Identity, on_front: bool, scenes: Sequence[
 def _quality_time(
     configs: Sequence[Configuration], headline: str, path: Path, title: str, about: str
 ) -> list[tuple[Path, str]]:
-    known = curve_identities(configs)
-    metrics = [m for m in ("psnr", "flip") if any(i.metric == m for i in known)]
-    regions = [headline, *(r for r in PARTITION if r != headline)]
-    panels = {
-        (metric, region): identity
-        for metric in metrics
-        for region in regions
-        for identity in known
-        if (identity.metric, identity.region) == (metric, region)
-    }
-    metrics = [m for m in metrics if any(metric == m for metric, _ in panels)]
-    regions = [r for r in regions if any(region == r for _, region in panels)]
-    if not panels:
+    panels = {(i.metric, i.region): i for i in curve_identities(configs)}
+    metrics = [m for m in ON_THE_CURVE if any((m, r) in panels for r in (headline, *PARTITION))]
+    regions = [r for r in dict.fromkeys((headline, *PARTITION)) if any((m, r) in panels for m in metrics)]
+    if not metrics:
         return []
     views = standing(run for c in configs for run in c.runs)
     drawn, axes = diagram.figure(len(regions), len(metrics), width=4.2, height=3.8)

@@ -79,9 +79,8 @@ def inpainting_section(labelled: Mapping[str, Sequence[RunResult]]) -> list[Bloc
 
 
 def _painted(run: RunResult) -> list[Mapping[str, Any]]:
-    return [event.data for event in run.record.events if event.kind == Inpainted.kind][
-        -1:
-    ]  # the last, if a run was resumed
+    events = [event.data for event in run.record.events if event.kind == Inpainted.kind]
+    return events[-1:]  # the last, if a run was resumed
 
 
 def _mean(values: Iterable[Measured]) -> float:

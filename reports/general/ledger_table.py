@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from itertools import chain
 
 from ihbench.clock.ledger import REDONE, in_order
 from ihbench.document.document import Block, Heading, Paragraph, Table, Words, bullets, emphasis, strong
@@ -85,22 +86,15 @@ def ledger_section(runs: Sequence[RunResult]) -> list[Block]:
 
 
 def _table(columns: dict[str, list[Account]]) -> Table:
-    found = dict.fromkeys(path for accounts in columns.values() for a in accounts for path in a.stages)
+    paths = in_order(dict.fromkeys(path for accounts in columns.values() for a in accounts for path in a.stages))
     lines: list[tuple[Words, ...]] = []
-    for path in in_order(found):
-        name = INDENT * path.count("/") + path.rpartition("/")[2]
-        cells: list[Words] = []
-        for accounts in columns.values():
-            having = [a for a in accounts if path in a.stages]
-            cells += (
-                _cells(math.fsum(a.stages[path] for a in having) / len(accounts), accounts) if having else ["", ""]
-            )
-        lines.append((name, *cells))
-    unnamed: list[Words] = []
-    total: list[Words] = []
-    for accounts in columns.values():
-        unnamed += _cells(math.fsum(a.unnamed for a in accounts) / len(accounts), accounts)
-        total += _cells(math.fsum(a.wall for a in accounts) / len(accounts), accounts)
+    for path in paths:
+        cells = [
+            _cells([a.stages[path] for a in accounts if path in a.stages], accounts) for accounts in columns.values()
+        ]
+        lines.append((INDENT * path.count("/") + path.rpartition("/")[2], *chain(*cells)))
+    unnamed = chain(*(_cells([a.unnamed for a in accounts], accounts) for accounts in columns.values()))
+    total = chain(*(_cells([a.wall for a in accounts], accounts) for accounts in columns.values()))
     lines += [(emphasis(UNNAMED), *unnamed), (strong(TOTAL), *total)]
     head: list[Words] = ["stage"]
     for label, accounts in columns.items():
@@ -108,8 +102,11 @@ def _table(columns: dict[str, list[Account]]) -> Table:
     return Table(tuple(head), tuple(lines))
 
 
-def _cells(seconds: float, accounts: Sequence[Account]) -> list[Words]:
-    wall = math.fsum(a.wall for a in accounts) / len(accounts)
+def _cells(parts: Sequence[float], accounts: Sequence[Account]) -> list[Words]:
+    """Mean seconds and their share of the wall clock; empty where no account has the stage."""
+    if not parts:
+        return ["", ""]
+    seconds, wall = (math.fsum(values) / len(accounts) for values in (parts, (a.wall for a in accounts)))
     return [f"{seconds:.2f}", f"{100 * seconds / wall:.1f}" if wall > 0 else "—"]
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from ihbench.commands.options.parse import options
+from ihbench.commands.options.run_filters import RowOptions
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.record import outputs
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class TableOptions:
+class TableOptions(RowOptions):
     runs: Path = Path("runs")
     """Folder of run folders; finished runs under the table's protocols become measured rows."""
     method: str | None = None
@@ -31,13 +32,8 @@ class TableOptions:
     """How it is written."""
     regions: tuple[str, ...] = ()
     """Several regions of measured numbers, a block for each."""
-    rows: tuple[str, ...] = ()
-    """Only these rows, in this order: names as in the tables, bounds such as truth, or a method, which stands for all
-    of its rows unless one has just that name."""
     metrics: tuple[str, ...] = ()
     """Only these metrics, as psnr or lpips."""
-    names: tuple[str, ...] = ()
-    """Other names for rows, OLD=NEW."""
     fragment: bool = False
     """Only the table, without a document around it; in LaTeX the tabular alone, for \\input."""
     as_printed: bool = False

@@ -18,3 +18,14 @@ class RunFilters:
     """Only runs on this scene."""
     profile: str | None = None
     """Only runs under this profile."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RowOptions:
+    """Which rows of a table are shown, and what they are called."""
+
+    rows: tuple[str, ...] = ()
+    """Only these rows, in this order: names as in the tables, bounds such as truth, or a method, which stands for all
+    of its rows unless one has just that name."""
+    names: tuple[str, ...] = ()
+    """Other names for rows, OLD=NEW."""
