@@ -177,22 +177,12 @@ def camera_id(name: str) -> str:
 def read_metadata(path: Path) -> dict[str, dict]:
     """metadata.json: frame name -> its entry, not yet looked into. Raises `BadInput`."""
     try:
-        content = json.loads(read_text(path, "camera and pose of every frame"), object_pairs_hook=_once)
+        content = json.loads(read_text(path, "camera and pose of every frame"), object_pairs_hook=atomic.unique_keys)
     except (ValueError, RecursionError) as error:
         detail = "nested too deeply" if isinstance(error, RecursionError) else one_line(error)
         raise BadInput(f"{path}: not valid JSON in UTF-8 ({detail}); copy the file again") from None
     if not isinstance(content, dict) or not all(isinstance(entry, dict) for entry in content.values()):
         raise BadInput(f"{path}: expected one dictionary for each frame name, found {described(content)}")
-    return content
-
-
-def _once(pairs: list[tuple[str, atomic.Json]]) -> dict[str, atomic.Json]:
-    """A JSON object; the parser itself would silently keep the last of two equal keys."""
-    content = dict(pairs)
-    if len(content) < len(pairs):
-        seen: set[str] = set()
-        twice = next(key for key, _ in pairs if key in seen or seen.add(key))
-        raise ValueError(f"{twice[:40]!r} is there twice")
     return content
 
 

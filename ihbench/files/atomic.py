@@ -176,6 +176,16 @@ def decode(value: Any) -> Any:
     return value
 
 
+def unique_keys(pairs: list[tuple[str, Json]]) -> dict[str, Json]:
+    """A JSON object, for the parser, which would keep the last of two equal keys. Raises `ValueError` for these."""
+    content, seen = dict(pairs), set()
+    for key, _ in pairs:
+        if key in seen:
+            raise ValueError(f"{key[:40]!r} is there twice")
+        seen.add(key)
+    return content
+
+
 def _beside(path: Path) -> Path:
     """A hidden name in the same folder, short enough whatever the file is called."""
     return path.parent / f".{path.name[:60]}.{os.getpid()}.{secrets.token_hex(4)}.tmp"

@@ -379,19 +379,12 @@ def _content(file: Path, largest: int) -> str:
 
 def _parsed(file: Path, text: str, where: str = "") -> Any:
     try:
-        value = json.loads(text, object_pairs_hook=_once, parse_constant=_refused)
+        value = json.loads(text, object_pairs_hook=atomic.unique_keys, parse_constant=_refused)
         return atomic.decode(value)
     except RecursionError as error:
         raise BadInput(f"{file}{where}: not valid JSON (nested too deeply)") from error
     except ValueError as error:
         raise BadInput(f"{file}{where}: not valid JSON ({str(error)[:200]})") from error
-
-
-def _once(pairs: list[tuple[str, atomic.Json]]) -> dict[str, atomic.Json]:
-    made = dict(pairs)
-    if len(made) != len(pairs):
-        raise ValueError("a key stands twice in one object")
-    return made
 
 
 def _refused(word: str) -> Any:
