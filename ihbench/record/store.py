@@ -45,7 +45,6 @@ from ihbench.record.schema import (
     curve_points,
     read_json,
     record_fault,
-    score_lines,
 )
 
 NOTHING = About()
@@ -166,11 +165,6 @@ class RunFolder:
     @property
     def checkpoints(self) -> Path:
         return self.path / "checkpoints"
-
-    def scores(self) -> list[ScoreLine]:
-        """Rows of scores.jsonl; none when nothing was scored. Raises `BadInput` for a damaged file."""
-        file = self.path / "scores.jsonl"
-        return score_lines(file) if os.path.lexists(file) else []
 
     def curve(self) -> list[CurvePoint]:
         """Quality-time points in order. Raises `BadInput` for a damaged file."""

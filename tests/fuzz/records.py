@@ -297,7 +297,6 @@ def _borrow(runs: Path, good: Path, victim: Path) -> None:
 def _go_on(runs: Path, good: Path, victim: Path) -> None:
     run = RunFolder.open(victim)
     Ledger(state=as_json(run.record.ledger) if run.record.ledger else None).table()
-    run.scores()
     run.curve()
 
 
