@@ -65,14 +65,6 @@ def _small_sine(angle: float) -> Answer:
     return Answer(_rotations(np.array([0, 0, angle]))[:, 1, 0], math.sin(angle), 1.0)
 
 
-def _single_precision(angle: float) -> Answer:
-    vector = np.array([0, 0, angle], np.float32)
-    return Answer(
-        _torch_rotation(vector, "float32"), about_z(float(vector[2])), angle, scale=max(1.0, angle),
-        precision=np.float32,
-    )  # fmt: skip
-
-
 def _orthonormal() -> Answer:
     """R Rᵀ = I for 400 axes at angles from 1e-9 to 30."""
     rng = np.random.default_rng(0)
@@ -206,17 +198,6 @@ def _sliver(width: float) -> Answer:
     return Answer(found, [*map(float, tip), 32], condition, scale=1.0, precision=np.float32)
 
 
-def _huge_triangle() -> Answer:
-    """Corners 1e9 px away: the depth is constant, so every pixel has it."""
-    triangle = [[-1e9, -1e9, 2.5], [3e9, -1e9, 2.5], [-1e9, 3e9, 2.5]]
-    return Answer(_drawn([triangle]).depth, 2.5, precision=np.float32)
-
-
-def _coincident() -> Answer:
-    """The lower index wins where two faces lie in one place."""
-    return Answer([_drawn([BIG, BIG], backend).face for backend in ("numpy", "numba")], 0)
-
-
 def _shared_edge() -> Answer:
     """Two triangles share a diagonal through pixel centres: no crack, and each such pixel has one owner."""
     square = [[[0, 0, 2], [32, 0, 2], [32, 32, 2]], [[0, 0, 2], [32, 32, 2], [0, 32, 2]]]
@@ -236,11 +217,6 @@ def _twins_on_noise() -> Answer:
     return Answer(int(((a.face != b.face) | (a.depth != b.depth) | (a.bary != b.bary).any(-1)).sum()), 0)
 
 
-def _normals_without_area() -> Answer:
-    vertices = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [1e-12, 1e-12, 0.0]])
-    return Answer(vertex_normals(vertices, np.array([[0, 1, 2], [3, 3, 3]])), 0.0)
-
-
 # ----------------------------------------------------------------------------------------------------
 # Texture coordinates
 
@@ -255,13 +231,6 @@ def _texel_coordinates() -> Answer:
     longest = np.maximum(np.square(e1).sum(1), np.square(e2).sum(1))
     found = np.einsum("nk,nkc->nc", texels.bary, corners)
     return Answer(found, texels.uv, float((longest / area).max()), scale=1.0)
-
-
-def _seams() -> Answer:
-    """Every texel's corners belong to one chart: its triangle in the map and on the body are the same face, and its
-    weights lie in 0..1."""
-    texels = texel_table(load_body(), 128)
-    return Answer([-float(texels.bary.min()), float(texels.bary.max())], [0.0, 1.0])
 
 
 def _constant_map() -> Answer:
@@ -316,12 +285,6 @@ def _behind() -> Answer:
     return Answer([int(rasterize(p, np.array([[0, 1, 2]]), 32, 32).mask.sum()), *p[:, 2]], [0, -2, -2, -2])
 
 
-def _box_around_the_camera() -> Answer:
-    """A body around the camera fills the view."""
-    vertices = np.array([[-1, -1, -1], [1, 1, 1.0]])
-    return Answer(int(projected_box(vertices, front_camera(), 0.05).sum()), 32 * 32)
-
-
 def _strong_lens() -> Answer:
     """Distortion far off the axis, where terms of the sixth power rule."""
     coefficients = [-0.24, 0.08, 2e-3, -1.5e-3, 0.01]
@@ -343,17 +306,6 @@ def _resampled() -> Answer:
     camera = Camera(np.array([[1e5, 0, 511.7], [0, 1e5, 300.1], [0, 0, 1]]), np.eye(3), np.zeros(3), 1024, 768)
     points = np.random.default_rng(0).uniform(1, 2, (50, 3))
     return Answer(camera.scaled(512, 384).project(points)[:, :2], camera.project(points)[:, :2] / 2)
-
-
-def _straight_down() -> Answer:
-    """A camera that looks along its own up has no image axes: it is said, not handed on as NaN."""
-    up = np.array([0.0, 1.0, 0.0])
-    return Answer(words_of(ValueError, lambda: look_at(3 * up, np.zeros(3), up)), "look_at")
-
-
-def _nan_camera() -> Answer:
-    said = words_of(ValueError, lambda: Camera(np.full((3, 3), math.nan), np.eye(3), np.zeros(3), 8, 8))
-    return Answer(said, "camera K: expected finite values")
 
 
 def _wrist_twist() -> Answer:
@@ -380,6 +332,8 @@ _rotation = partial(_geometry, unit="ulp", tolerance=4, why=ROTATION)
 _camera = partial(_geometry, unit="ulp", tolerance=8, why=RATIONAL)
 
 
+UP = np.array([0.0, 1.0, 0.0])
+PI = float(np.float32(math.pi))
 ANGLES = {
     "zero": 0.0, "1e-160": 1e-160, "1e-8": 1e-8, "series-edge": 0.01, "pi": math.pi, "pi-1e-9": math.pi - 1e-9,
     "two-pi": 2 * math.pi, "two-pi+1e-9": 2 * math.pi + 1e-9, "hundred": 100.0,
@@ -399,7 +353,9 @@ CASES = [
             (1e-5, ""),
         )
     ),
-    _rotation("rotation-float32-pi", "about z by π in single precision", partial(_single_precision, math.pi)),
+    _rotation("rotation-float32-pi", "about z by π in single precision",
+              lambda: Answer(_torch_rotation(np.array([0, 0, PI]), "float32"), about_z(PI), math.pi, scale=math.pi,
+                             precision=np.float32)),
     _geometry("rotation-orthonormal", "R Rᵀ of 400 turns by 1e-9 to 30 rad", _orthonormal, "ulp", 8,
               "two matrices with errors of 2 ulp, and their product"),
     *(
@@ -435,14 +391,21 @@ CASES = [
     _exact("triangle-behind-near", "a corner just behind the near plane",
            partial(_at_near, float(np.nextafter(NEAR, 0)), False)),
     _geometry("triangle-sliver", "2e-9 px across, 64 px along", partial(_sliver, 1e-9), "ulp", 1, FLOAT32),
-    _geometry("triangle-huge", "corners 1e9 px away", _huge_triangle, "ulp", 1, FLOAT32),
-    _exact("triangle-coincident", "two faces in one place", _coincident),
+    _geometry("triangle-huge", "corners 1e9 px away",
+              lambda: Answer(_drawn([[[-1e9, -1e9, 2.5], [3e9, -1e9, 2.5], [-1e9, 3e9, 2.5]]]).depth, 2.5,
+                             precision=np.float32), "ulp", 1, FLOAT32),
+    _exact("triangle-coincident", "two faces in one place",
+           lambda: Answer([_drawn([BIG, BIG], backend).face for backend in ("numpy", "numba")], 0)),
     _exact("triangle-shared-edge", "an edge through pixel centres", _shared_edge),
     _geometry("triangle-twins", "numpy against numba on 2000 wild triangles", _twins_on_noise, "absolute", 0, BITS),
-    _exact("normals-no-area", "vertices whose faces have no area", _normals_without_area),
+    _exact("normals-no-area", "vertices whose faces have no area",
+           lambda: Answer(vertex_normals(np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [1e-12, 1e-12, 0.0]]),
+                                         np.array([[0, 1, 2], [3, 3, 3]])), 0.0)),
     _geometry("uv-texel-centres", "where barycentrics put every texel", _texel_coordinates, "ulp", 64,
               "a sliver of the atlas has a condition number of hundreds; most is lost and found again in the sum"),
-    _geometry("uv-seams", "barycentrics at the seams lie in 0..1", _seams, "at most", 1e-9,
+    _geometry("uv-seams", "barycentrics at the seams lie in 0..1",
+              lambda: Answer([float((s * texel_table(load_body(), 128).bary).max()) for s in (-1, 1)], [0.0, 1.0]),
+              "at most", 1e-9,
               "the z-buffer decides on inside in px of 1/128, the barycentrics are taken in uv"),
     _geometry("uv-constant-map", "a map of one value, sampled on and beyond the edges", _constant_map, "ulp", 2,
               "weights that sum to 1 within an ulp"),
@@ -454,11 +417,16 @@ CASES = [
             partial(_projected, front_camera(500.0), (1e-7, -2e-7, 1e-6))),
     _exact("camera-on-plane", "points of depth 0", _on_the_plane),
     _exact("camera-behind", "a triangle behind the camera", _behind),
-    _exact("camera-inside-box", "the camera inside the body's box", _box_around_the_camera),
+    _exact("camera-inside-box", "the camera inside the body's box",
+           lambda: Answer(int(projected_box(np.array([[-1, -1, -1], [1, 1, 1.0]]), front_camera(), 0.05).sum()),
+                          32 * 32)),
     _geometry("camera-strong-lens", "distortion at 5 focal lengths off the axis", _strong_lens, "ulp", 8,
               "a polynomial of degree 7, in ulps of the sum of its terms' sizes"),
     _geometry("camera-resampled", "half the image size at a focal length of 1e5 px", _resampled, "ulp", 0,
               "powers of two commute with rounding"),
-    _refused("camera-straight-down", "looking along its own up", _straight_down),
-    _refused("camera-nan", "an intrinsic matrix of NaN", _nan_camera),
+    _refused("camera-straight-down", "looking along its own up",
+             lambda: Answer(words_of(ValueError, lambda: look_at(3 * UP, np.zeros(3), UP)), "look_at")),
+    _refused("camera-nan", "an intrinsic matrix of NaN",
+             lambda: Answer(words_of(ValueError, lambda: Camera(np.full((3, 3), math.nan), np.eye(3), UP, 8, 8)),
+                            "camera K: expected finite values")),
 ]  # fmt: skip

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.metrics import mean_over_frames, psnr, ssim
-from ihbench.metrics.aggregate import Score
+from ihbench.metrics.aggregate import Mean, Score
 from ihbench.metrics.flip import flip
 from ihbench.metrics.oracles.cases import hashed
 from ihbench.metrics.oracles.flip_oracle import flip_oracle
@@ -71,11 +71,6 @@ def condition_of_ssim(x: NDArray, y: NDArray) -> float:
 # Answers
 
 
-def _identical(metric: str, dtype: type) -> Answer:
-    image = texture(1, dtype=dtype)
-    return Answer(METRICS[metric](image, image.copy()), PERFECT[metric])
-
-
 def _one_step(dtype: type) -> Answer:
     """One value of one pixel moves to the neighbouring number of its type."""
     truth = flat(0.5, dtype=dtype) if dtype != np.uint8 else flat(128, dtype=dtype)
@@ -121,10 +116,6 @@ def _green_and_blue() -> Answer:
     green, blue = np.zeros((2, 20, 18, 3))
     green[..., 1], blue[..., 2] = 1, 1
     return Answer(flip(green, blue), 1.0)
-
-
-def _empty_mask(metric: str) -> Answer:
-    return Answer(METRICS[metric](texture(1), texture(2), np.zeros((20, 18), np.bool_)), math.nan)
 
 
 def _one_pixel_psnr() -> Answer:
@@ -217,10 +208,8 @@ def _order_of_sums() -> Answer:
     return Answer(psnr(x, y), -10 * math.log10(total / x.size / 255**2))
 
 
-def _infinite_frames() -> Answer:
-    scores = [Score(v, PSNR_FULL) for v in (math.inf, 20.0, 30.0)]
-    mean = mean_over_frames(scores)
-    return Answer([mean.value, mean.infinite, mean.n], [25.0, 1, 2])
+def _mean_psnr(*values: float) -> Mean:
+    return mean_over_frames(Score(v, PSNR_FULL) for v in values)
 
 
 def _intervals() -> Answer:
@@ -240,7 +229,8 @@ _oracle = partial(_metric, unit="absolute", tolerance=1e-12, why=ORACLE)
 
 CASES = [
     *(
-        _exact(f"{m}-identical-{t.__name__}", "an image and its copy", partial(_identical, m, t))
+        _exact(f"{m}-identical-{t.__name__}", "an image and its copy",
+               lambda m=m, t=t: Answer(METRICS[m](texture(1, dtype=t), texture(1, dtype=t)), PERFECT[m]))
         for m in METRICS
         for t in (np.uint8, np.float16)
     ),
@@ -262,7 +252,9 @@ CASES = [
     ),
     _metric("flip-green-blue", "the two colours that FLIP is scaled by", _green_and_blue, "absolute", 1e-12, CLOSED),
     _oracle("flip-black-white", "black against white", lambda: _against_oracle("flip", flat(0, 8, 8), flat(1, 8, 8))),
-    *(_exact(f"{m}-empty-mask", "a region without a pixel", partial(_empty_mask, m)) for m in METRICS),
+    *(_exact(f"{m}-empty-mask", "a region without a pixel",
+             lambda m=m: Answer(METRICS[m](texture(1), texture(2), np.zeros((20, 18), np.bool_)), math.nan))
+      for m in METRICS),
     _metric("psnr-one-pixel-mask", "a region of one pixel in a corner", _one_pixel_psnr, "ulp", 4, CLOSED),
     *(
         _metric(f"{m}-one-pixel-mask", "a region of one pixel in a corner",
@@ -320,9 +312,10 @@ CASES = [
     _exact("psnr-one-perfect-channel", "channel PSNRs, one channel without error", _one_perfect_channel),
     _metric("psnr-order-of-sums", "a million 8-bit pixels", _order_of_sums, "ulp", 1,
             "integers add up exactly; one division and one logarithm round"),
-    _exact("mean-infinite-frames", "one of three frames has no error", _infinite_frames),
+    _exact("mean-infinite-frames", "one of three frames has no error",
+           lambda: Answer([(mean := _mean_psnr(math.inf, 20.0, 30.0)).value, mean.infinite, mean.n], [25.0, 1, 2])),
     _exact("mean-all-infinite", "no frame has an error",
-           lambda: Answer(mean_over_frames([Score(math.inf, PSNR_FULL)] * 3).value, math.inf)),
+           lambda: Answer(_mean_psnr(math.inf, math.inf, math.inf).value, math.inf)),
     _metric("intervals-few-subjects", "one subject, equal subjects, two subjects", _intervals, "absolute", 1e-15,
             EXACT),
 ]  # fmt: skip
