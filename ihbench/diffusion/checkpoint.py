@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from ihbench.diffusion.quiet_libraries import quiet_libraries
 from ihbench.errors import BadInput
 from ihbench.files.paths import user_path
 from ihbench.files.regular import read_text
@@ -104,14 +106,18 @@ def empty_module(folder: Path, build: Callable[[], Any]) -> Any:
     """A module with parameters on the meta device. Raises `BadInput` when the library rejects its configuration."""
     from accelerate import init_empty_weights
 
+    with readable(f"{folder / 'config.json'}: not a usable configuration"), init_empty_weights(include_buffers=False):
+        return build()
+
+
+@contextmanager
+def readable(otherwise: str) -> Iterator[None]:
+    """Turns whatever a damaged file makes of the libraries inside into a `BadInput` that begins with `otherwise`."""
     try:
-        with init_empty_weights(include_buffers=False):
-            return build()
-    except Exception as error:  # the libraries raise all sorts for a bad value
-        first = str(error).strip().splitlines() or [type(error).__name__]
-        raise BadInput(
-            f"{folder / 'config.json'}: not a usable configuration ({first[0]}); fetch it again"
-        ) from error
+        with quiet_libraries():
+            yield
+    except Exception as error:  # all sorts
+        raise BadInput(f"{otherwise} ({_line(error)}); fetch it again") from error
 
 
 class UnreadModule:
@@ -134,18 +140,15 @@ class UnreadModule:
                 name = rename(stored)
                 if name is not None:
                     self.names[name], shapes[name] = (file, stored), shape
-        wanted = {name: tuple(tensor.shape) for name, tensor in module.state_dict().items()}
-        self._compare(wanted, shapes)
-
-    def _compare(self, wanted: dict[str, tuple[int, ...]], shapes: dict[str, tuple[int, ...]]) -> None:
+        expected = {name: tuple(tensor.shape) for name, tensor in module.state_dict().items()}
         faults = []
-        if missing := [name for name in wanted if name not in shapes]:
-            faults.append(f"{len(missing)} of {len(wanted)} tensors are missing ({missing[0]})")
-        if extra := [name for name in shapes if name not in wanted]:
+        if missing := [name for name in expected if name not in shapes]:
+            faults.append(f"{len(missing)} of {len(expected)} tensors are missing ({missing[0]})")
+        if extra := [name for name in shapes if name not in expected]:
             faults.append(f"{len(extra)} are not of this model ({extra[0]})")
-        if wrong := [name for name in wanted if name in shapes and shapes[name] != wanted[name]]:
+        if wrong := [name for name in expected if name in shapes and shapes[name] != expected[name]]:
             name = wrong[0]
-            faults.append(f"{len(wrong)} have another shape ({name} is {[*shapes[name]]}, not {[*wanted[name]]})")
+            faults.append(f"{len(wrong)} have another shape ({name} is {[*shapes[name]]}, not {[*expected[name]]})")
         if faults:
             raise BadInput(
                 f"{self.folder}: the weights do not fit config.json: {'; '.join(faults)}; fetch both from one source"
@@ -200,4 +203,4 @@ def _unreadable(file: Path, error: Exception) -> BadInput:
 
 
 def _line(error: Exception) -> str:
-    return str(error).splitlines()[0] if str(error) else type(error).__name__
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)

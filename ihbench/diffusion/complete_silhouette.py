@@ -27,11 +27,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench.diffusion.checkpoint import has_pickles, read_json, weight_files
+from ihbench.diffusion.checkpoint import has_pickles, read_json, readable, weight_files
 from ihbench.diffusion.crops.crop_view import CropView
 from ihbench.diffusion.crops.part_map import smpl_parts
 from ihbench.diffusion.memory import said_when_full
-from ihbench.diffusion.quiet_libraries import quiet_libraries
 from ihbench.errors import BadInput
 from ihbench.files.paths import user_path
 
@@ -265,16 +264,12 @@ def _load_sam(weights: str, device: str) -> tuple[Any, Any]:
         from transformers import SamHQModel, SamHQProcessor
     except ImportError as error:
         raise BadInput(f"silhouette 'sam' needs transformers 4.52 or newer ({error}); update it") from error
-    try:
-        with quiet_libraries():
-            loaded: Any = SamHQModel.from_pretrained(
-                str(folder), local_files_only=True, use_safetensors=True, output_loading_info=True
-            )
-            model, report = loaded
-            processor = SamHQProcessor.from_pretrained(str(folder), local_files_only=True)
-    except Exception as error:  # the libraries raise all sorts for a bad file
-        first = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise BadInput(f"{SAM_OPTION} {folder}: not readable ({first}); fetch it again") from error
+    with readable(f"{SAM_OPTION} {folder}: not readable"):
+        loaded: Any = SamHQModel.from_pretrained(
+            str(folder), local_files_only=True, use_safetensors=True, output_loading_info=True
+        )
+        model, report = loaded
+        processor = SamHQProcessor.from_pretrained(str(folder), local_files_only=True)
     bad = [*report["missing_keys"], *(key[0] for key in report["mismatched_keys"])]
     if bad:
         # from_pretrained makes them up

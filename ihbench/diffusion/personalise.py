@@ -26,14 +26,7 @@ from ihbench.diffusion.memory import ADVICE, halved
 from ihbench.diffusion.subject_token import ANYBODY, SubjectToken
 from ihbench.errors import BadInput
 
-TI_SHARES = (
-    0.35,
-    0.10,
-    0.10,
-    0.10,
-    0.10,
-    0.25,
-)  # kinds of masks: more often everything, so that the word must say it
+TI_SHARES = (0.35, 0.10, 0.10, 0.10, 0.10, 0.25)  # kinds of masks: more often everything: the word must say it
 BACKGROUND_WEIGHT = 0.15  # of blocks without the person
 GOOD_EVERY = 20  # steps between two copies to roll back to
 TEXT_LR = 1e-5  # of LoRA on the text encoder
@@ -248,13 +241,10 @@ class Personaliser:
         self, state: str, step: int, named: dict[str, nn.Parameter], optimizer: torch.optim.Optimizer, curve: Curve
     ) -> None:
         tensors: dict[str, Tensor] = {f"p.{name}": p.detach() for name, p in named.items()}
-        if step < self._steps(state):
+        if step < (self.config.ti_steps if state == TI_STATE else self.config.lora_steps):
             for name, p in named.items():
                 tensors |= {f"adam.{name}.{key}": value for key, value in optimizer.state[p].items()}
         self.ledger.save_state(state, tensors, {"step": step, "steps": curve.steps, "losses": curve.losses})
-
-    def _steps(self, state: str) -> int:
-        return self.config.ti_steps if state == TI_STATE else self.config.lora_steps
 
     def _restored(
         self, state: str, named: dict[str, nn.Parameter], optimizer: torch.optim.Optimizer, curve: Curve
@@ -266,13 +256,9 @@ class Personaliser:
         with torch.no_grad():
             for name, p in named.items():
                 p.copy_(torch.as_tensor(tensors[f"p.{name}"]))
-                keys = ("step", "exp_avg", "exp_avg_sq")
-                kept = {
-                    key: torch.as_tensor(tensors[f"adam.{name}.{key}"]).clone()
-                    for key in keys
-                    if f"adam.{name}.{key}" in tensors
-                }
-                if kept:
+                if f"adam.{name}.step" in tensors:
+                    keys = ("step", "exp_avg", "exp_avg_sq")
+                    kept = {key: torch.as_tensor(tensors[f"adam.{name}.{key}"]).clone() for key in keys}
                     optimizer.state[p] = {k: v if k == "step" else v.to(p.device) for k, v in kept.items()}
         curve.steps[:], curve.losses[:] = list(meta["steps"]), list(meta["losses"])
         self.ledger.event(Resumed(state, int(meta["step"])))

@@ -32,6 +32,7 @@ from ihbench.diffusion.checkpoint import (
     find_folder,
     has_pickles,
     read_json,
+    readable,
     weight_files,
 )
 from ihbench.diffusion.memory import said_when_full
@@ -55,12 +56,8 @@ ENCODER_SHAPE = (
     "block_out_channels", "down_block_types", "layers_per_block", "cross_attention_dim", "attention_head_dim",
     "use_linear_projection",
 )  # fmt: skip
-OLD_ATTENTION = {
-    "query": "to_q",
-    "key": "to_k",
-    "value": "to_v",
-    "proj_attn": "to_out.0",
-}  # VAE before diffusers 0.14
+# of a VAE before diffusers 0.14
+OLD_ATTENTION = {"query": "to_q", "key": "to_k", "value": "to_v", "proj_attn": "to_out.0"}
 
 
 @dataclass(frozen=True)
@@ -152,10 +149,11 @@ def _number_type(dtype: str, device: torch.device) -> torch.dtype:
 
 def _check_layout(folder: Path) -> None:
     """Everything that is missing, in one line."""
-    if (folder / "text_encoder_2").is_dir():
-        raise BadInput(f"{folder}: this is SDXL (it has text_encoder_2/); {WRONG_MODEL}")
-    if (folder / "transformer").is_dir():
-        raise BadInput(f"{folder}: this is a model with a transformer/ for a UNet; {WRONG_MODEL}")
+    _refuse(
+        folder,
+        ((folder / "text_encoder_2").is_dir(), "this is SDXL (it has text_encoder_2/)"),
+        ((folder / "transformer").is_dir(), "this is a model with a transformer/ for a UNet"),
+    )
     if (folder / "config.json").is_file() and not (folder / "unet").is_dir():
         raise BadInput(f"{folder}: this is one part of a model; give the folder above it; {LAYOUT}")
     lacking, pickled = [], []
@@ -185,26 +183,27 @@ def _check_layout(folder: Path) -> None:
 def _check_model(folder: Path, configs: dict[str, Config]) -> None:
     """Stable Diffusion 2 inpainting by its layers; widths are only compared with each other."""
     unet, vae, text = configs["unet"], configs["vae"], configs["text_encoder"]
-    where = folder / "unet" / "config.json"
-    _check_sd2_unet(where, unet)
-    channels = unet.get("in_channels")
-    if channels == 4:
-        raise BadInput(
-            f"{where}: in_channels is 4: this is the base model, not the inpainting one (9); {WRONG_MODEL}. The base "
-            f"model may be given as {CONTROL_OPTION}"
-        )
-    if channels != 9:
-        raise BadInput(
-            f"{where}: in_channels is {channels}, expected 9 (latents, mask, masked latents); {WRONG_MODEL}"
-        )
-    if vae.get("_class_name") != "AutoencoderKL" or vae.get("latent_channels") != 4:
-        raise BadInput(
-            f"{folder / 'vae' / 'config.json'}: {vae.get('_class_name')} with {vae.get('latent_channels')} latent "
-            f"channels, expected AutoencoderKL with 4; {WRONG_MODEL}"
-        )
+    _check_sd2_unet(folder / "unet" / "config.json", unet)
+    channels, latents = unet.get("in_channels"), vae.get("latent_channels")
+    _refuse(
+        folder / "unet" / "config.json",
+        (
+            channels == 4,
+            f"in_channels is 4: this is the base model, not the inpainting one (9); it may be given as "
+            f"{CONTROL_OPTION}",
+        ),
+        (channels != 9, f"in_channels is {channels}, expected 9 (latents, mask, masked latents)"),
+    )
+    _refuse(
+        folder / "vae" / "config.json",
+        (
+            vae.get("_class_name") != "AutoencoderKL" or latents != 4,
+            f"{vae.get('_class_name')} with {latents} latent channels, expected AutoencoderKL with 4",
+        ),
+    )
     where, width = folder / "text_encoder" / "config.json", unet["cross_attention_dim"]
-    if text.get("model_type", "clip_text_model") != "clip_text_model":
-        raise BadInput(f"{where}: model_type is {text['model_type']}, expected clip_text_model; {WRONG_MODEL}")
+    kind = text.get("model_type", "clip_text_model")
+    _refuse(where, (kind != "clip_text_model", f"model_type is {kind}, expected clip_text_model"))
     if text.get("hidden_size") != width:
         raise BadInput(
             f"{where}: hidden_size is {text.get('hidden_size')}, but the UNet reads text of width {width} "
@@ -214,21 +213,29 @@ def _check_model(folder: Path, configs: dict[str, Config]) -> None:
 
 def _check_sd2_unet(where: Path, unet: Config) -> None:
     """What sets the UNet of Stable Diffusion 2 apart, whatever its width and its input channels."""
-    if unet.get("_class_name") != "UNet2DConditionModel":
-        raise BadInput(f"{where}: {unet.get('_class_name')}, expected UNet2DConditionModel; {WRONG_MODEL}")
-    if unet.get("addition_embed_type") == "text_time" or unet.get("cross_attention_dim") == 2048:
-        raise BadInput(f"{where}: this is SDXL; {WRONG_MODEL}")
+    kind, out, width = (unet.get(name) for name in ("_class_name", "out_channels", "cross_attention_dim"))
     heads = unet.get("attention_head_dim")
-    if not unet.get("use_linear_projection") or not isinstance(heads, list) or unet.get("cross_attention_dim") == 768:
-        raise BadInput(
-            f"{where}: this is Stable Diffusion 1.5 or a model like it (attention_head_dim {heads}, "
-            f"cross_attention_dim {unet.get('cross_attention_dim')}); {WRONG_MODEL}"
-        )
-    if not isinstance(unet.get("cross_attention_dim"), int) or unet.get("out_channels") != 4:
-        raise BadInput(
-            f"{where}: out_channels {unet.get('out_channels')}, cross_attention_dim "
-            f"{unet.get('cross_attention_dim')}; expected 4 and one number; {WRONG_MODEL}"
-        )
+    _refuse(
+        where,
+        (kind != "UNet2DConditionModel", f"{kind}, expected UNet2DConditionModel"),
+        (unet.get("addition_embed_type") == "text_time" or width == 2048, "this is SDXL"),
+        (
+            not unet.get("use_linear_projection") or not isinstance(heads, list) or width == 768,
+            f"this is Stable Diffusion 1.5 or a model like it (attention_head_dim {heads}, cross_attention_dim "
+            f"{width})",
+        ),
+        (
+            not isinstance(width, int) or out != 4,
+            f"out_channels {out}, cross_attention_dim {width}; expected 4 and one number",
+        ),
+    )
+
+
+def _refuse(where: Path, *rules: tuple[bool, str]) -> None:
+    """Raises `BadInput` for the first rule that is met: this is another model."""
+    for is_met, why in rules:
+        if is_met:
+            raise BadInput(f"{where}: {why}; {WRONG_MODEL}")
 
 
 def _unread(folder: Path, configs: dict[str, Config]) -> tuple[Any, Any, Any]:
@@ -313,21 +320,21 @@ def _scheduler(folder: Path) -> Any:
 
     where = folder / "scheduler" / "scheduler_config.json"
     config = read_json(where)
-    if "beta_schedule" not in config:
-        raise BadInput(f"{where}: {config.get('_class_name')} without beta_schedule; {WRONG_MODEL}")
-    if config.get("prediction_type", "epsilon") not in ("epsilon", "v_prediction"):
-        raise BadInput(
-            f"{where}: prediction_type is {config['prediction_type']}, expected epsilon or v_prediction; "
-            f"{WRONG_MODEL}"
-        )
+    prediction = config.get("prediction_type", "epsilon")
+    _refuse(
+        where,
+        ("beta_schedule" not in config, f"{config.get('_class_name')} without beta_schedule"),
+        (
+            prediction not in ("epsilon", "v_prediction"),
+            f"prediction_type is {prediction}, expected epsilon or v_prediction",
+        ),
+    )
     known = inspect.signature(DDIMScheduler.__init__).parameters
     fields = {name: value for name, value in config.items() if name in known}
     # other schedulers do not name it, and DDIM's own default clips, which is wrong for latents
     fields.setdefault("clip_sample", False)
-    try:
+    with readable(f"{where}: not a usable configuration"):
         return DDIMScheduler(**fields)
-    except (TypeError, ValueError, NotImplementedError, RuntimeError) as error:
-        raise BadInput(f"{where}: not a usable configuration ({error}); fetch it again") from error
 
 
 def _tokenizer(folder: Path, text: Config) -> Any:
@@ -335,11 +342,8 @@ def _tokenizer(folder: Path, text: Config) -> Any:
     from transformers import CLIPTokenizerFast  # type: ignore[attr-defined]  # made on the fly in 5
 
     where = folder / "tokenizer"
-    try:
+    with readable(f"{where}: not a readable CLIP tokenizer"):
         tokenizer: Any = CLIPTokenizerFast.from_pretrained(str(where), local_files_only=True)
-    except Exception as error:  # the libraries raise all sorts for a bad file
-        first = str(error).strip().splitlines() or [type(error).__name__]
-        raise BadInput(f"{where}: not a readable CLIP tokenizer ({first[0]}); fetch this folder again") from error
     size = text.get("vocab_size")
     if not isinstance(size, int) or len(tokenizer) > size:
         raise BadInput(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -11,7 +9,7 @@ from typing import Any
 import torch
 
 from ihbench.diffusion.backbone import Backbone
-from ihbench.diffusion.checkpoint import UnreadModule, empty_module
+from ihbench.diffusion.checkpoint import UnreadModule, empty_module, readable
 from ihbench.diffusion.mini.folder import SHIPPED, STEMS, check_mini
 from ihbench.diffusion.mini.model import SIZE
 from ihbench.diffusion.quiet_libraries import quiet_libraries
@@ -45,7 +43,7 @@ def _save(backbone: Backbone, folder: Path) -> None:
 def load_mini(folder: Path | None = None, device: str = "cpu") -> Backbone:
     """The shipped backbone, or one that `ihbench train-mini` wrote, frozen. Raises `BadInput` for another folder, and
     for weights that are damaged, missing, superfluous or not finite: none is made up."""
-    found, configs = check_mini(SHIPPED if folder is None else folder)
+    root, configs = check_mini(SHIPPED if folder is None else folder)
     from diffusers import ControlNetModel, DDIMScheduler, UNet2DConditionModel
 
     from ihbench.diffusion.mini.block_transform import BlockTransform
@@ -53,23 +51,22 @@ def load_mini(folder: Path | None = None, device: str = "cpu") -> Backbone:
     place = torch.device(device)
 
     def part(name: str, kind: Any) -> Any:
-        with quiet_libraries():
-            module = empty_module(found / name, lambda: kind.from_config(configs[name]))
-        return UnreadModule(module, found / name, STEMS[name]).read(place, torch.float32)
+        module = empty_module(root / name, lambda: kind.from_config(configs[name]))
+        return UnreadModule(module, root / name, STEMS[name]).read(place, torch.float32)
 
-    tokenizer = mini_tokenizer(found)
+    tokenizer = mini_tokenizer(root)
     known = configs["text_encoder"].get("vocab_size")
     if not isinstance(known, int) or len(tokenizer) > known:
         raise BadInput(
-            f"{found / 'tokenizer'}: {len(tokenizer)} words, but the text encoder has {known}; take both from one "
+            f"{root / 'tokenizer'}: {len(tokenizer)} words, but the text encoder has {known}; take both from one "
             f"training"
         )
-    with _readable(found / "scheduler"):
-        scheduler: Any = DDIMScheduler.from_pretrained(found / "scheduler")
+    with readable(f"{root / 'scheduler'}: not a readable part of a mini backbone"):
+        scheduler: Any = DDIMScheduler.from_pretrained(root / "scheduler")
     return Backbone(
         name="mini",
         unet=part("unet", UNet2DConditionModel),
-        text_encoder=unread_text_encoder(found / "text_encoder", configs["text_encoder"]).read(place, torch.float32),
+        text_encoder=unread_text_encoder(root / "text_encoder", configs["text_encoder"]).read(place, torch.float32),
         tokenizer=tokenizer,
         controlnet=part("controlnet", ControlNetModel),
         codec=part("codec", BlockTransform),
@@ -84,18 +81,5 @@ def mini_tokenizer(folder: Path) -> Any:
     """The tokenizer of a folder that `check_mini` has looked at. Raises `BadInput` for a damaged one."""
     from transformers import AutoTokenizer
 
-    with _readable(folder / "tokenizer"):
+    with readable(f"{folder / 'tokenizer'}: not a readable part of a mini backbone"):
         return AutoTokenizer.from_pretrained(folder / "tokenizer", local_files_only=True)
-
-
-@contextmanager
-def _readable(folder: Path) -> Iterator[None]:
-    """Turns whatever a damaged file makes of the libraries' readers into one line."""
-    try:
-        with quiet_libraries():
-            yield
-    except Exception as error:
-        words = str(error).splitlines()
-        raise BadInput(
-            f"{folder}: not a readable part of a mini backbone ({words[0] if words else type(error).__name__})"
-        ) from error
