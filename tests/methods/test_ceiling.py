@@ -9,6 +9,7 @@ import math
 import numpy as np
 import pytest
 
+from ihbench.document.document import write
 from ihbench.methods.inpainthuman.inpainting.painted_view import PaintedView
 from ihbench.methods.inpainthuman.studies.ceiling import CeilingRow, painted_psnr, with_truth
 from ihbench.methods.inpainthuman.studies.ceiling_command import table
@@ -87,8 +88,9 @@ def test_a_run_between_its_first_stage_and_its_ceiling(bench, tmp_path):
 
 def test_the_table_has_gains_paired_over_scenes():
     def rows(base: float) -> list[CeilingRow]:
-        def scores(value: float) -> dict[str, float]:
-            return {"psnr/pooled/range1/hidden/v1": value, "psnr/pooled/range1/visible/v1": math.nan}
+        def scores(value: float) -> dict[Identity, float]:
+            values = {"hidden": value, "visible": math.nan}
+            return {Identity.parse(f"psnr/pooled/range1/{region}/v1"): score for region, score in values.items()}
 
         return [
             CeilingRow("stage 1 alone", None, math.nan, scores(base)),
@@ -96,7 +98,7 @@ def test_the_table_has_gains_paired_over_scenes():
             CeilingRow("true images", 1.0, math.inf, scores(base + 3)),
         ]
 
-    text = table([("a", rows(18.0)), ("b", rows(20.0)), ("b", rows(22.0))], "three runs")
+    text = write(table([("a", rows(18.0)), ("b", rows(20.0)), ("b", rows(22.0))], "three runs"), "md")
     assert "| stage 1 alone | — | 19.50 |  |" in text
     assert "| as painted | 20.00 | 20.50 | +1.00 [+1.00, +1.00] |" in text
     assert "| true images | ∞ | 22.50 | +3.00 [+3.00, +3.00] |" in text

@@ -43,10 +43,7 @@ class CeilingOptions(Report):
 def main(argv: list[str]) -> int:
     from ihbench.commands.options.parse import options
 
-    return _ceiling(options(CeilingOptions, argv, "ceiling", f"Measure {SPEC.commands['ceiling'].summary}."))
-
-
-def _ceiling(chosen: CeilingOptions) -> int:
+    chosen = options(CeilingOptions, argv, "ceiling", f"Measure {SPEC.commands['ceiling'].summary}.")
     from ihbench.clock.progress import Progress
     from ihbench.methods.inpainthuman.studies.ceiling import ceiling
     from ihbench.record import outputs
@@ -63,20 +60,21 @@ def _ceiling(chosen: CeilingOptions) -> int:
     groups = {result.group[:3] for result in results}
     if len(groups) > 1:
         raise BadInput(f"ceiling: runs of one protocol and profile at a time, got {sorted(map(str, groups))}")
-    progress, found = Progress(), []
+    progress, of_runs = Progress(), []
     blocks: list[Block] = []
     numbers: dict[str, object] = {}
     for result in results:
         shares = tuple(sorted(set(chosen.truth)))
         rows = ceiling(result.folder, shares, chosen.data, chosen.body, chosen.device, progress)
-        found.append((result.scene, rows))
+        of_runs.append((result.scene, rows))
         for row in rows:
-            told = ", ".join(f"{region} {_mean(row, region):.2f}" for region in REGIONS)
-            progress.say(f"{result.scene} seed {result.seed}, {row.name}: {told}")
-        runs = [_numbers(r, its_rows) for r, (_, its_rows) in zip(results, found, strict=False)]
-        title = _title(results[: len(found)])
+            means = ", ".join(f"{region} {_mean(row, region):.2f}" for region in REGIONS)
+            progress.say(f"{result.scene} seed {result.seed}, {row.name}: {means}")
+        scenes = len({scene for scene, _ in of_runs})
+        title = f"{results[0].identity.protocol}, {len(of_runs)} runs of {scenes} scenes, {results[0].data}"
+        runs = [_numbers(r, its_rows) for r, (_, its_rows) in zip(results, of_runs, strict=False)]
         numbers = {"title": title, "runs": runs}
-        blocks = table(found, title)
+        blocks = table(of_runs, title)
         if chosen.out is not None:  # after every run: the next may take minutes
             outputs.write_text(chosen.out / "ceiling.md", write(blocks, "md"))
             outputs.write_json(chosen.out / "ceiling.json", numbers)
@@ -84,22 +82,17 @@ def _ceiling(chosen: CeilingOptions) -> int:
     return 0
 
 
-def _title(results: Sequence[RunResult]) -> str:
-    scenes = len({result.scene for result in results})
-    return f"{results[0].identity.protocol}, {len(results)} runs of {scenes} scenes, {results[0].data}"
-
-
-def table(found: Sequence[tuple[str, Sequence[CeilingRow]]], title: str) -> list[Block]:
+def table(of_runs: Sequence[tuple[str, Sequence[CeilingRow]]], title: str) -> list[Block]:
     """A row for each painting, means over scenes, differences to stage 1 paired over scenes."""
-    regions = [region for region in REGIONS if any(math.isfinite(_mean(rows[0], region)) for _, rows in found)]
+    regions = [region for region in REGIONS if any(math.isfinite(_mean(rows[0], region)) for _, rows in of_runs)]
     heads = [text for region in regions for text in (f"PSNR {region} ↑", "over stage 1")]
     lines = []
-    for k, row in enumerate(found[0][1]):
-        quality = _average([(scene, rows[k].painted_psnr) for scene, rows in found])
+    for k, row in enumerate(of_runs[0][1]):
+        quality = _average([(scene, rows[k].painted_psnr) for scene, rows in of_runs])
         cells = [_decibels(_over_scenes(quality))]
         for region in regions:
-            own = _average([(scene, _mean(rows[k], region)) for scene, rows in found])
-            first = _average([(scene, _mean(rows[0], region)) for scene, rows in found])
+            own = _average([(scene, _mean(rows[k], region)) for scene, rows in of_runs])
+            first = _average([(scene, _mean(rows[0], region)) for scene, rows in of_runs])
             cells += [_decibels(_over_scenes(own)), "" if row.truth is None else _gain(own, first)]
         lines.append((row.name, *cells))
     return [
@@ -148,8 +141,8 @@ def _decibels(value: float) -> str:
 
 
 def _numbers(result: RunResult, rows: Sequence[CeilingRow]) -> dict[str, object]:
-    def plain(value: float) -> float | str | None:
-        return None if math.isnan(value) else "inf" if math.isinf(value) else value
+    def plain(value: float) -> float | None:
+        return None if math.isnan(value) else value
 
     return {
         "scene": result.scene,

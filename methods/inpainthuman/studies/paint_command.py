@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from ihbench.commands.options.device import check_device
 from ihbench.commands.options.printing import Report
@@ -49,10 +49,6 @@ def main(argv: list[str]) -> int:
     from ihbench.commands.options.parse import options
 
     chosen = options(PaintOptions, argv, "paint", "Compare painters on hidden pixels whose truth is known.")
-    return _paint(chosen)
-
-
-def _paint(chosen: Any) -> int:
     from ihbench import registry
     from ihbench.clock.progress import Progress
     from ihbench.document.document import write
@@ -81,16 +77,9 @@ def _paint(chosen: Any) -> int:
         capture, body = source.open(scene, chosen.body, progress)
         data = capture.standin or capture.variant
         scenes[scene], picture = paint_scene(
-            capture,
-            body,
-            protocols[0],
-            chosen.rows,
-            chosen.frames,
-            chosen.seed,
-            chosen.inpaint,
-            progress,
-            device=chosen.device,
-        )
+            capture, body, protocols[0], chosen.rows, chosen.frames, chosen.seed, chosen.inpaint, progress,
+            chosen.device,
+        )  # fmt: skip
         if chosen.out is not None:
             outputs.write_bytes(chosen.out / f"{scene}.png", encoded(picture, "PNG"))
             outputs.write_json(chosen.out / "paint.json", {"scenes": scenes, "summary": summary(scenes)})
