@@ -53,7 +53,6 @@ class ScoreOptions(ProtocolChanges, RunsFolder):
 def main(argv: list[str]) -> int:
     chosen = options(ScoreOptions, argv, "score", "Score images that somebody else's code rendered.")
     from ihbench.clock.progress import Progress
-    from ihbench.files.shape import as_json
     from ihbench.record.results import summary
 
     if chosen.names:
@@ -61,10 +60,7 @@ def main(argv: list[str]) -> int:
     results = scored(chosen, Progress())
     complete = all(not result.missing_views for result in results)
     if chosen.json:
-        told = summary(results)
-        for run, result in zip(told["runs"], results, strict=True):
-            run["predictions"] = as_json(result.about.predictions)
-        print(json.dumps(told, allow_nan=False))
+        print(json.dumps(summary(results), allow_nan=False))
     else:
         print(registry.load("report", "md")(results) if chosen.full else headline(results), end="")
     return 0 if complete and all(result.status == "done" for result in results) else 1

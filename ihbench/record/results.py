@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from ihbench.config_fields import Values
 from ihbench.errors import BadInput
 from ihbench.files import atomic
+from ihbench.files.shape import as_json
 from ihbench.metrics import Identity, Mean, Score, mean_over_frames
 from ihbench.record.schema import (
     About,
@@ -294,6 +295,7 @@ def summary(results: Iterable[RunResult]) -> dict[str, object]:
                 "fit_seconds": r.about.fit_seconds,
                 "total_seconds": r.about.total_seconds,
                 "peak_mb": r.about.peak_mb,
+                **({} if r.about.predictions is None else {"predictions": as_json(r.about.predictions)}),
             }
             for r in results
         ],
