@@ -139,8 +139,8 @@ def check(values: Any, prefix: str = "--", only: Collection[str] | None = None) 
             if isinstance(item, int | float) and not isinstance(item, bool):
                 for rule in bounds:
                     if not rule.holds(item):
-                        told = " and ".join(str(other) for other in bounds)
-                        raise BadInput(f"{flag} {shown(value)}: expected {told}")
+                        limits = " and ".join(str(other) for other in bounds)
+                        raise BadInput(f"{flag} {shown(value)}: expected {limits}")
 
 
 def refuse_repeated(values: Sequence[Any], flag: str) -> None:

@@ -51,13 +51,13 @@ def clashes(kind: str) -> dict[str, str]:
     None of them is taken: which one came last would depend on the order of installation. A distribution that lies in
     several places of the path counts once, as for Python, and so do several names of one object.
     """
-    found: dict[str, dict[str, str]] = {}
+    by_name: dict[str, dict[str, str]] = {}
     for point in entry_points(group=GROUPS[kind]):
-        found.setdefault(point.name, {})[point.value] = point.dist.name if point.dist is not None else point.module
+        by_name.setdefault(point.name, {})[point.value] = point.dist.name if point.dist is not None else point.module
     return {
         name: f"registered by {' and by '.join(f'{who} ({what})' for what, who in sorted(makers.items()))}; "
         "uninstall all but one of these packages, or have theirs renamed"
-        for name, makers in sorted(found.items())
+        for name, makers in sorted(by_name.items())
         if len(makers) > 1
     }
 
@@ -76,12 +76,12 @@ def nearest(name: str, known: list[str]) -> str:
 
 def entry_point(kind: str, name: str) -> EntryPoint:
     """The entry point itself. Raises `BadInput` for a name of several, and with the nearest known name."""
-    found = _found(kind)
+    points = _found(kind)
     if name in clashes(kind):
         raise BadInput(f"{kind} {name!r} is {clashes(kind)[name]}")
-    if name not in found:
-        raise BadInput(f"unknown {kind} {name!r}: {nearest(name, list(found))}")
-    return found[name]
+    if name not in points:
+        raise BadInput(f"unknown {kind} {name!r}: {nearest(name, list(points))}")
+    return points[name]
 
 
 def load(kind: str, name: str) -> Any:
@@ -143,9 +143,9 @@ def source(kind: str, name: str) -> Path:
         origin = Path(spec.origin)
         return origin.parent if spec.submodule_search_locations else origin
     for place in (spec.submodule_search_locations or ()) if spec is not None else ():  # folders without __init__.py
-        found = _deepest(Path(place), inner)
-        if found != Path(place):
-            return found
+        inner_folder = _deepest(Path(place), inner)
+        if inner_folder != Path(place):
+            return inner_folder
     raise BadInput(f"{kind} {name!r}: the source of {module!r} cannot be found")
 
 

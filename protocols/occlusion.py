@@ -143,10 +143,10 @@ def blocks(request: OcclusionRequest) -> Occlusion:
         rng = _rng(request, frame)
         order = rng.permutation(np.unique(cell[person]))
         counts = np.bincount(cell[person])[order]
-        wanted = request.rule.fraction * person.sum()
-        whole = int(np.searchsorted(np.cumsum(counts), wanted, side="right"))
+        pixels = request.rule.fraction * person.sum()
+        whole = int(np.searchsorted(np.cumsum(counts), pixels, side="right"))
         out = np.isin(cell, order[:whole])
-        missing = int(np.ceil(wanted - counts[:whole].sum()))
+        missing = int(np.ceil(pixels - counts[:whole].sum()))
         if missing > 0:
             last = cell == order[whole]
             stop = _first_share((last & person).sum(1), missing / counts[whole])
@@ -177,8 +177,8 @@ def pasted_object(request: OcclusionRequest) -> Occlusion:
         outline = 1 + (shape[0] * np.cos(angle) + shape[1] * np.sin(angle)).sum(-1).clip(-0.6, 2)
         size = np.hypot(dx, dy) / outline  # the object of this size reaches the pixel
         reach = np.sort(size[person])
-        wanted = int(np.ceil(request.rule.fraction * len(reach)))
-        return size <= reach[wanted - 1] if wanted else np.zeros(person.shape, bool)
+        count = int(np.ceil(request.rule.fraction * len(reach)))
+        return size <= reach[count - 1] if count else np.zeros(person.shape, bool)
 
     return _per_frame("object", request, hidden)
 

@@ -233,12 +233,12 @@ def _hair(c: Chart, style: Style) -> NDArray[np.bool_]:
 def albedo(c: Chart, style: Style) -> NDArray[np.float32]:
     """[N, 3] sRGB colour of every point, without light."""
     label = part_labels(c, style)
-    painters = {Part.UPPER_CLOTHES: _top, Part.TROUSERS: _bottom, Part.HAIR: _hair_colour}
-    painters |= {Part.LEFT_SHOE: _shoes, Part.RIGHT_SHOE: _shoes}
+    colour_of = {Part.UPPER_CLOTHES: _top, Part.TROUSERS: _bottom, Part.HAIR: _hair_colour}
+    colour_of |= {Part.LEFT_SHOE: _shoes, Part.RIGHT_SHOE: _shoes}
     out = np.empty((len(label), 3))
     for part in np.unique(label):
         here = label == part
-        out[here] = painters.get(Part(part), _skin)(c.at(here), style)
+        out[here] = colour_of.get(Part(part), _skin)(c.at(here), style)
     return np.clip(out, 0, 1).astype(np.float32)
 
 

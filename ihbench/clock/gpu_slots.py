@@ -37,8 +37,8 @@ def free_memory() -> list[int]:
     """Bytes that are free of each card that torch sees. Asked in a process of its own, because asking
     takes memory of each. Raises `BadInput` where they do not say."""
     try:
-        told = subprocess.run([sys.executable, "-c", ASK], capture_output=True, text=True, timeout=300, check=True)
-        free = json.loads(told.stdout.splitlines()[-1])
+        answer = subprocess.run([sys.executable, "-c", ASK], capture_output=True, text=True, timeout=300, check=True)
+        free = json.loads(answer.stdout.splitlines()[-1])
     except (OSError, subprocess.SubprocessError, ValueError, IndexError) as error:
         raise BadInput(f"--device cuda: the cards do not say how much of their memory is free ({error})") from error
     if not free:

@@ -63,8 +63,8 @@ def _ablate(chosen: AblateOptions) -> int:
     from ihbench.clock.progress import Progress
 
     if chosen.ladder == "list":
-        for name, found in _suites(chosen.method).items():
-            print(f"{name:<12}{len(found.variants)} rungs: {found.title}")
+        for name, suite in _suites(chosen.method).items():
+            print(f"{name:<12}{len(suite.variants)} rungs: {suite.title}")
         return 0
     config = profile_of(chosen)
     vary = {
@@ -156,13 +156,13 @@ def _suite(chosen: AblateOptions, vary: Mapping[str, Sequence[Any]], switches: M
 
 def _named(words: Sequence[str], flag: str) -> dict[str, str]:
     """Name -> text of several NAME=TEXT. Raises `BadInput` for another form, and for a name given twice."""
-    found = [word.partition("=") for word in words]
-    for word, (name, _, text) in zip(words, found, strict=True):
+    pairs = [word.partition("=") for word in words]
+    for word, (name, _, text) in zip(words, pairs, strict=True):
         if not name or not text:
             raise BadInput(f"{flag} {word}: expected NAME=VALUE")
-    names = [name.removeprefix("method.").replace("-", "_") for name, _, _ in found]
+    names = [name.removeprefix("method.").replace("-", "_") for name, _, _ in pairs]
     refuse_repeated(names, flag)
-    return dict(zip(names, (text for _, _, text in found), strict=True))
+    return dict(zip(names, (text for _, _, text in pairs), strict=True))
 
 
 def _value(chosen: AblateOptions, config: Any, name: str, text: str) -> Any:

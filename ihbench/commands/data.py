@@ -82,8 +82,8 @@ def _check(chosen: Check) -> int:
         if body is not None:
             mesh, warnings = look_at_mesh(body)
             report = replace(report, body_mesh=mesh, warnings=warnings)
-        found = report.as_json()
-        chosen.show(found, _blocks(report), "\n".join(_lines(found)))
+        report_json = report.as_json()
+        chosen.show(report_json, _blocks(report), "\n".join(_lines(report_json)))
         return 0 if report.ok else 1
     other = folder_nearby(folder, registry.names("dataset"))
     if other is not None:

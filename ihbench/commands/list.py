@@ -31,13 +31,13 @@ class ListOptions(Printing):
 def main(argv: list[str]) -> int:
     chosen = options(ListOptions, argv, "list", "What is registered, one line each.")
     kinds = KINDS if chosen.kind == "all" else (chosen.kind,)
-    found = {kind: _described(kind) for kind in kinds}
+    kinds_shown = {kind: _described(kind) for kind in kinds}
     if chosen.kind == "all":
-        found |= _clashes()
+        kinds_shown |= _clashes()
     blocks: list[Block] = []
-    for kind, rows in found.items():
+    for kind, rows in kinds_shown.items():
         blocks += [Heading(2, kind), Table(("name", "what it is"), tuple(rows.items()), left=2, bare=True)]
-    chosen.show(found, blocks)
+    chosen.show(kinds_shown, blocks)
     return 0
 
 
@@ -58,37 +58,37 @@ def _described(kind: str) -> dict[str, str]:
 
 def _each(kind: str, describe: Callable[[str], tuple[str, str]]) -> dict[str, str]:
     """Every registered name as it is listed, with a word about it; or with what is wrong with it."""
-    found = {}
+    out = {}
     for name in registry.names(kind):
         try:
             registry.entry_point(kind, name)
             listed, about = describe(name)
         except (BadInput, ImportError, OSError, ValueError) as error:
             listed, about = name, f"cannot be used: {error}"
-        found[listed] = about
-    return found
+        out[listed] = about
+    return out
 
 
 def _clashes() -> dict[str, dict[str, str]]:
     """Names of any kind that several packages claim."""
-    told = {f"{kind} {name}": why for kind in registry.GROUPS for name, why in registry.clashes(kind).items()}
+    notes = {f"{kind} {name}": why for kind in registry.GROUPS for name, why in registry.clashes(kind).items()}
     hidden = "is registered by another package; the bench's own is the one that runs"
-    told |= {f"command {name}": hidden for spec in usable_specs() for name in spec.commands if name in COMMANDS}
-    return {"clashes": told} if told else {}
+    notes |= {f"command {name}": hidden for spec in usable_specs() for name in spec.commands if name in COMMANDS}
+    return {"clashes": notes} if notes else {}
 
 
 def _metrics() -> dict[str, str]:
     """Each preset, and after it each of its identity strings with the definition in a line."""
-    found = {}
+    metrics = {}
     for name in registry.names("metric preset"):
         try:
             preset = registry.load("metric preset", name)
         except BadInput as error:
-            found[name] = f"cannot be used: {error}"
+            metrics[name] = f"cannot be used: {error}"
             continue
-        found[name] = f"{preset.about} [{preset.source}]"
+        metrics[name] = f"{preset.about} [{preset.source}]"
         for measure in preset.measures:
             regions = "" if measure.regions is None else f" (over {', '.join(measure.regions)})"
             identity = str(measure.identity("REGION", (1.0, 1.0, 1.0)))
-            found[identity] = measure.about + regions
-    return found
+            metrics[identity] = measure.about + regions
+    return metrics

@@ -31,24 +31,24 @@ def main(argv: list[str]) -> int:
     chosen = options(Check, argv, "metrics", "Check the metrics against oracles, libraries and stored values.")
     from ihbench.metrics.oracles.check import check, mismatches
 
-    found = check(examples=chosen.lpips_examples)
-    wrong = mismatches(found)
-    rows = [asdict(c) | {"difference": c.difference, "ok": c.ok} for c in found]
-    compared = sum(not c.absent for c in found)
-    counted = f"{compared} comparisons, {len(wrong)} mismatches, {len(found) - compared} not possible here"
-    blocks = [*_blocks(found if chosen.all else _worst(found)), Paragraph(counted)]
+    comparisons = check(examples=chosen.lpips_examples)
+    wrong = mismatches(comparisons)
+    rows = [asdict(c) | {"difference": c.difference, "ok": c.ok} for c in comparisons]
+    compared = sum(not c.absent for c in comparisons)
+    counted = f"{compared} comparisons, {len(wrong)} mismatches, {len(comparisons) - compared} not possible here"
+    blocks = [*_blocks(comparisons if chosen.all else _worst(comparisons)), Paragraph(counted)]
     chosen.show({"ok": not wrong, "comparisons": rows}, blocks)
     return 1 if wrong else 0
 
 
 def _worst(comparisons: Sequence[Comparison]) -> list[Comparison]:
     """Of each metric and reference the comparison nearest to its tolerance, or beyond; what is absent stays."""
-    found: dict[tuple[str, str], Comparison] = {}
+    worst_of: dict[tuple[str, str], Comparison] = {}
     for c in comparisons:
         key = c.metric, c.reference
-        if key not in found or _share(c) > _share(found[key]):
-            found[key] = c
-    return list(found.values())
+        if key not in worst_of or _share(c) > _share(worst_of[key]):
+            worst_of[key] = c
+    return list(worst_of.values())
 
 
 def _share(c: Comparison) -> float:

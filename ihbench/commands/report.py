@@ -126,8 +126,8 @@ def _matching(chosen: ReportOptions) -> tuple[list[RunResult], list[str]]:
 
     if not chosen.runs.is_dir():
         return [], []
-    wanted = {name: getattr(chosen, name) for name in ("protocol", "method", "scene", "profile")}
-    return Index(chosen.runs).results(**{name: value for name, value in wanted.items() if value is not None})
+    filters = {name: getattr(chosen, name) for name in ("protocol", "method", "scene", "profile")}
+    return Index(chosen.runs).results(**{name: value for name, value in filters.items() if value is not None})
 
 
 def _on_terminal() -> bool:

@@ -172,12 +172,12 @@ def _matching(chosen: Filters) -> list[RunLine]:
 
     if chosen.status is not None and chosen.status not in (*STATUSES, DAMAGED):
         raise BadInput(f"--status {chosen.status}: {registry.nearest(chosen.status, [*STATUSES, DAMAGED])}")
-    wanted = _filters(chosen)
+    filters = _filters(chosen)
     if chosen.status == DAMAGED:
-        wanted["status"] = UNREADABLE
+        filters["status"] = UNREADABLE
     index = Index(chosen.runs)
-    entries = index.query(**wanted)
-    results = {result.folder.name: result for result in index.results(**wanted)[0]} if entries else {}
+    entries = index.query(**filters)
+    results = {result.folder.name: result for result in index.results(**filters)[0]} if entries else {}
     return [_row(chosen.runs / entry.name, entry, results.get(entry.name)) for entry in entries]
 
 

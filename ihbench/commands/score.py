@@ -85,12 +85,12 @@ def scored(chosen: ScoreOptions, progress: Progress) -> list[RunResult]:
         progress.say(f"{protocol.name} {scene}: predictions {name}, {protocol.profile} profile")
         results.append(score_scene(request, source, scene, progress))
     for result in results:
-        found = result.about.predictions
-        assert found is not None
-        for kind, paths in (("missing", found.missing), ("surplus", found.surplus)):
+        files = result.about.predictions
+        assert files is not None
+        for kind, paths in (("missing", files.missing), ("surplus", files.surplus)):
             for path in paths:
                 progress.say(f"{result.scene}: {kind}: {path}")
-        for note in [*found.notes, *found.doubts]:
+        for note in [*files.notes, *files.doubts]:
             progress.say(f"{result.scene}: {note}")
     return results
 
@@ -140,9 +140,10 @@ def _profile_of(chosen: ScoreOptions, sources: Mapping[str, DataSource]) -> str:
     if not count:
         return first
     sizes = {profile: source.protocol.image.size for profile, source in sources.items()}
-    told = ", ".join(f"{size} px in {profile}" for profile, size in sizes.items())
+    sizes_text = ", ".join(f"{size} px in {profile}" for profile, size in sizes.items())
     raise BadInput(
-        f"predictions {chosen.predictions}: most are {side} px on their longer side; {chosen.protocol} has {told}; "
+        f"predictions {chosen.predictions}: most are {side} px on their longer side; "
+        f"{chosen.protocol} has {sizes_text}; "
         f"say otherwise with --image-size"
     )
 
@@ -155,13 +156,13 @@ def _with_folders(scenes: tuple[str, ...], root: Path, pattern: str | None) -> t
                 f"--pattern {pattern!r}: does not tell the scenes apart; add {{scene}}, or name one with --scene"
             )
         return scenes
-    found = tuple(scene for scene in scenes if (root / scene).is_dir())
-    if not found and pattern is None and len(scenes) > 1:
+    present = tuple(scene for scene in scenes if (root / scene).is_dir())
+    if not present and pattern is None and len(scenes) > 1:
         raise BadInput(
             f"predictions {root}: no folder of the name of a scene ({', '.join(scenes)}); "
             "name the scene of these images with --scene"
         )
-    return found or scenes
+    return present or scenes
 
 
 def _print_names(chosen: ScoreOptions, source: DataSource) -> int:

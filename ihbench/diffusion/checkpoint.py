@@ -61,12 +61,12 @@ Config = dict[str, Any]  # of a model of diffusers or transformers, as they writ
 
 def read_json(path: Path) -> Config:
     try:
-        found = json.loads(read_text(path, "a JSON file"))
+        content = json.loads(read_text(path, "a JSON file"))
     except (BadInput, ValueError, RecursionError) as error:
         raise BadInput(f"{path}: not readable as JSON ({_line(error)}); fetch this file again") from error
-    if not isinstance(found, dict):
-        raise BadInput(f"{path}: expected a JSON object, found {type(found).__name__}; fetch this file again")
-    return found
+    if not isinstance(content, dict):
+        raise BadInput(f"{path}: expected a JSON object, found {type(content).__name__}; fetch this file again")
+    return content
 
 
 def weight_files(folder: Path, stem: str) -> list[Path]:

@@ -109,18 +109,18 @@ def load_sd2(
     """
     device = torch.device(device)
     number = _number_type(dtype, device)
-    found = look_at_sd2(weights, control)
-    vae_number = torch.float32 if found.vae_upcast else number
-    too_small = f"{OPTION} {found.folder}: {device} has too little free memory for these weights"
+    parts = look_at_sd2(weights, control)
+    vae_number = torch.float32 if parts.vae_upcast else number
+    too_small = f"{OPTION} {parts.folder}: {device} has too little free memory for these weights"
     with said_when_full(f"{too_small}; free some, or use another GPU"):
         # part by part, so that no more than one is in memory twice
-        text_encoder = found.text_encoder.read(device, number)
-        vae = found.vae.read(device, vae_number)
-        unet = found.unet.read(device, number)
-        if found.controlnet is not None:
-            controlnet = found.controlnet.read(device, number)
-        elif found.base_unet is not None:
-            controlnet = new_controlnet(found.base_unet.read(torch.device("cpu"), number), 4, device, number)
+        text_encoder = parts.text_encoder.read(device, number)
+        vae = parts.vae.read(device, vae_number)
+        unet = parts.unet.read(device, number)
+        if parts.controlnet is not None:
+            controlnet = parts.controlnet.read(device, number)
+        elif parts.base_unet is not None:
+            controlnet = new_controlnet(parts.base_unet.read(torch.device("cpu"), number), 4, device, number)
         else:
             controlnet = new_controlnet(unet, 4, device, number)
     if memory_lean:
@@ -130,7 +130,7 @@ def load_sd2(
             module.to(memory_format=torch.channels_last)
     codec = LatentAutoencoder(vae)
     size = int(unet.config["sample_size"] or 64) * codec.block
-    return Backbone("sd2", unet, text_encoder, found.tokenizer, controlnet, codec, found.scheduler, size, square=True)
+    return Backbone("sd2", unet, text_encoder, parts.tokenizer, controlnet, codec, parts.scheduler, size, square=True)
 
 
 def _number_type(dtype: str, device: torch.device) -> torch.dtype:

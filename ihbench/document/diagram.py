@@ -190,17 +190,17 @@ def place_labels(
         width, height = LETTER * size * scale * len(label.text) + 3, 1.1 * size * scale
         offsets = _offsets(width, height)
         corner = np.array([(x + dx, y + dy) for dx, dy, _ in offsets])
-        found = np.concatenate([corner, corner + np.array([width, height])], 1)  # [offsets, 4]
-        free = (found[:, 0] >= frame.x0) & (found[:, 1] >= frame.y0)
-        free &= (found[:, 2] <= frame.x1) & (found[:, 3] <= frame.y1)
-        apart = (found[:, None, :2] >= boxes[None, :, 2:]) | (found[:, None, 2:] <= boxes[None, :, :2])
+        candidates = np.concatenate([corner, corner + np.array([width, height])], 1)  # [offsets, 4]
+        free = (candidates[:, 0] >= frame.x0) & (candidates[:, 1] >= frame.y0)
+        free &= (candidates[:, 2] <= frame.x1) & (candidates[:, 3] <= frame.y1)
+        apart = (candidates[:, None, :2] >= boxes[None, :, 2:]) | (candidates[:, None, 2:] <= boxes[None, :, :2])
         free &= apart.any(-1).all(-1)
         if not free.any():
             lost += 1
             continue
         k = int(free.argmax())
         dx, dy, leader = offsets[k]
-        boxes = np.concatenate([boxes, found[k : k + 1]])
+        boxes = np.concatenate([boxes, candidates[k : k + 1]])
         axes.annotate(
             words(label.text), label.point, xytext=(dx / scale, dy / scale), textcoords="offset points",
             fontsize=size, color=label.colour, zorder=5,

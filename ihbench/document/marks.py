@@ -26,11 +26,11 @@ def ranks(values: Sequence[float], higher_is_better: bool) -> list[int]:
 def marks_by_value(values: Sequence[float], higher_is_better: bool) -> list[str]:
     """ "best", "second" or "" for every value. Nothing is marked where nothing is better than something else,
     and of two numbers the second-best, which is the last, is not."""
-    found = ranks(values, higher_is_better)
-    if max(found, default=0) <= 1:
+    places = ranks(values, higher_is_better)
+    if max(places, default=0) <= 1:
         return [""] * len(values)
-    names = {1: BEST, 2: SECOND} if sum(rank > 0 for rank in found) > 2 else {1: BEST}
-    return [names.get(rank, "") for rank in found]
+    names = {1: BEST, 2: SECOND} if sum(rank > 0 for rank in places) > 2 else {1: BEST}
+    return [names.get(rank, "") for rank in places]
 
 
 @dataclass(frozen=True)

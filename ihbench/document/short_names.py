@@ -34,35 +34,35 @@ def letter(k: int) -> str:
 def split_label(label: str) -> tuple[str, str]:
     """A row's name without its switches, and these; ("ours", "") where there are none. Whatever else stands in the
     brackets, as that views are missing, stays in the name."""
-    found = LABEL.fullmatch(label)
-    if found is None:
+    match = LABEL.fullmatch(label)
+    if match is None:
         return label, ""
-    words = NEXT.split(found["words"])
+    words = NEXT.split(match["words"])
     switches, others = [w for w in words if "=" in w], [w for w in words if "=" not in w]
     kept = f" ({', '.join(others)})" if others else ""
-    return found["method"] + kept + found["rest"], ", ".join(switches)
+    return match["method"] + kept + match["rest"], ", ".join(switches)
 
 
 def with_short_names(blocks: Sequence[Block], longest: int = 0) -> list[Block]:
     """The same blocks; rows of tables with names longer than `longest` have their switches in a footnote below."""
     notes = Footnotes()
-    found: list[Block] = []
+    with_short_names: list[Block] = []
     for block in blocks:
         if not isinstance(block, Table):
-            found.append(block)
+            with_short_names.append(block)
             continue
-        told: dict[str, str] = {}
+        long_of: dict[str, str] = {}
         rows = []
         for row in block.rows:
             label = row[0]
             name, switches = split_label(label) if isinstance(label, str) and len(label) > longest else ("", "")
             if switches:
-                told[notes.letter(switches)] = switches
+                long_of[notes.letter(switches)] = switches
                 row = ((name, Span(notes.letter(switches), "raised")), *row[1:])
             rows.append(row)
-        found.append(replace(block, rows=tuple(rows)))
+        with_short_names.append(replace(block, rows=tuple(rows)))
         words: list[str | Span] = []
-        for mark, text in told.items():
+        for mark, text in long_of.items():
             words += ["; " if words else "", Span(mark, "raised"), f" {text}"]
-        found += [Paragraph(tuple(words))] if words else []
-    return found
+        with_short_names += [Paragraph(tuple(words))] if words else []
+    return with_short_names

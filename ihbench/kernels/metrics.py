@@ -126,16 +126,16 @@ def _lpips_in_double(network: Network, small: Case) -> tuple[float, float]:
 
     from ihbench.metrics.lpips import padded
 
-    found = []
+    values = []
     package = network.package.double()
     try:
         for pair in ((small.pred, small.truth), _painted(small.pred, small.truth)):
             x, y = (2 * as_torch(padded(image)).double() - 1 for image in pair)
             with torch.no_grad():
-                found.append(float(package(x, y)))
+                values.append(float(package(x, y)))
     finally:
         network.package.float()
-    return found[0], found[1]
+    return values[0], values[1]
 
 
 def _body(image: NDArray) -> NDArray[np.bool_]:
@@ -172,8 +172,8 @@ def frame_rows(repeats: int, size: int = SIZE) -> list[Row]:
             timings = interleave(steps, repeats)
         truth = preset_oracle("ihbench", small.pred, small.truth, _six(small), WHITE, lambda *_: 0.0)
         for name, preset in presets.items():
-            found = evaluate(small.pred, small.truth, _six(small), preset)
-            error = max(abs(score.value - truth[i]) for i, score in found.items() if not np.isnan(score.value))
+            scores = evaluate(small.pred, small.truth, _six(small), preset)
+            error = max(abs(score.value - truth[i]) for i, score in scores.items() if not np.isnan(score.value))
             memory = peak_mib(lambda p=preset, f=frame: evaluate(f.pred, f.truth, _six(f), p))
             rows.append(row_of("frame", f"6 regions, {share}@{size}", name, timings[name], memory, error))
     return rows

@@ -49,8 +49,8 @@ def lbs_rows(repeats: int, cases: Sequence[tuple[str, int]] = LBS_CASES) -> list
         for name, samples in timings.items():
             value, gradient = 0.0, None
             if name != "numpy f64":
-                found, *gradients = _skinned(getattr(torch, f"float{name[-2:]}"), given, body.parents)
-                value = float(np.linalg.norm(found.double().numpy() - exact, axis=-1).max())
+                posed, *gradients = _skinned(getattr(torch, f"float{name[-2:]}"), given, body.parents)
+                value = float(np.linalg.norm(posed.double().numpy() - exact, axis=-1).max())
                 gradient = max(_relative(g.double(), p) for g, p in zip(gradients[0], pulled, strict=True))
             rows.append(row_of("lbs", case, name, samples, peak_mib(steps[name]), value, gradient))
     return rows

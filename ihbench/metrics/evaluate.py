@@ -201,10 +201,10 @@ def evaluate(
 
 def find_preset(name: str) -> Preset:
     """The registered preset of that name. Raises `BadInput` with the nearest names."""
-    found = registry.load("metric preset", name)
-    if not isinstance(found, Preset):
+    registered = registry.load("metric preset", name)
+    if not isinstance(registered, Preset):
         raise BadInput(f"metric preset {name!r}: registered object is no ihbench.metrics.evaluate.Preset")
-    return found
+    return registered
 
 
 def _known_outcomes(region: Mask | None, known: list[tuple[Mask | None, dict[int, float | str]]]) -> dict:

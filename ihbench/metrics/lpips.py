@@ -67,10 +67,10 @@ def lpips(
         raise BadInput(network)
     rectangle = (slice(None), slice(None))
     if mask is not None:
-        found = bounds(mask if cut is None else cut)
-        if found is None or not mask.any():
+        box = bounds(mask if cut is None else cut)
+        if box is None or not mask.any():
             return math.nan
-        rectangle = found
+        rectangle = box
     x, y = (_colors(image[rectangle]) for image in (pred, truth))
     if mask is not None:
         inside = mask[rectangle][..., None]
@@ -94,8 +94,8 @@ def lacking(net: str) -> str:
     """Why there is no LPIPS with this trunk here; "" when there is. Imports no torch."""
     if _random:
         return ""
-    found = locate(FILES[f"lpips-{net}"])
-    return found if isinstance(found, str) else ""
+    weights = locate(FILES[f"lpips-{net}"])
+    return weights if isinstance(weights, str) else ""
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -174,10 +174,10 @@ def load(net: str) -> Network | str:
         if _random:
             return _random[net]
         if net not in _loaded:
-            found = locate(FILES[f"lpips-{net}"])
-            if isinstance(found, str):
-                return found
-            network = _read(net, found)
+            weights = locate(FILES[f"lpips-{net}"])
+            if isinstance(weights, str):
+                return weights
+            network = _read(net, weights)
             if isinstance(network, str):
                 return network
             _loaded[net] = network

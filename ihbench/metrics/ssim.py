@@ -215,8 +215,8 @@ def _deficit_of(
     from ihbench.metrics import ssim_kernel as kernel
 
     (height, width), radius = pred.shape[:2], window.size // 2
-    wanted = band.first < band.last
-    left, right = int(band.first[wanted].min()), int(band.last[wanted].max())
+    filled = band.first < band.last
+    left, right = int(band.first[filled].min()), int(band.last[filled].max())
     # rows and columns that the windows reach; where the image ends earlier the border rule takes over
     outer = (
         slice(max(band.rows.start - radius, 0), min(band.rows.stop + radius, height)),
@@ -224,10 +224,10 @@ def _deficit_of(
     )
     s, d = _sum_and_difference(pred[outer], truth[outer], None if painted is None else painted[outer], background)
     channels = s.shape[2]
-    counts = np.ones((len(wanted), s.shape[1]), np.bool_)
+    counts = np.ones((len(filled), s.shape[1]), np.bool_)
     if counted is not None:
         counts = np.ascontiguousarray(counted[band.rows, outer[1]])
-    keep = np.empty((len(wanted), s.shape[1] * channels) if values is not None else (0, 0))
+    keep = np.empty((len(filled), s.shape[1] * channels) if values is not None else (0, 0))
     weights = np.zeros(-(-window.size // kernel.GROUP) * kernel.GROUP)
     weights[: window.size] = window.weights
     scale = (window.data_range * peak_of(pred.dtype)) ** 2
@@ -238,8 +238,8 @@ def _deficit_of(
         band.last - outer[1].start, counts, values is not None, keep,
     )  # fmt: skip
     if values is not None:
-        kept = keep.reshape(len(wanted), -1, channels)
-        for i in np.flatnonzero(wanted):
+        kept = keep.reshape(len(filled), -1, channels)
+        for i in np.flatnonzero(filled):
             columns = slice(band.first[i], band.last[i])
             row = kept[i, columns.start - outer[1].start : columns.stop - outer[1].start]
             values[band.top + i, columns] = row.reshape(values[band.top + i, columns].shape)

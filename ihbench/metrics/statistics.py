@@ -304,5 +304,5 @@ def _wilcoxon_p(differences: NDArray[np.float64]) -> float:
     kept = differences[differences != 0]  # here, since some scipy versions take zeros as a reason not to be exact
     if not len(kept):
         return 1.0
-    found: Any = stats.wilcoxon(kept)
-    return float(found.pvalue)
+    outcome: Any = stats.wilcoxon(kept)
+    return float(outcome.pvalue)

@@ -71,10 +71,10 @@ def folders() -> list[Path]:
     own, torch_home, users = path_from("IHBENCH_WEIGHTS"), path_from("TORCH_HOME"), users_cache()
     if torch_home is None and users is not None:
         torch_home = users / "torch"
-    found = [*([own] if own else []), *([torch_home / "hub" / "checkpoints"] if torch_home else [])]
-    if not found:
+    folders = [*([own] if own else []), *([torch_home / "hub" / "checkpoints"] if torch_home else [])]
+    if not folders:
         raise BadInput("this user has no home folder to keep weights in; name a folder for them with IHBENCH_WEIGHTS")
-    return found
+    return folders
 
 
 def locate(weights: WeightFile) -> Path | str:
@@ -161,13 +161,13 @@ def fetch(weights: WeightFile, progress: Progress) -> Path:
 
 def states(names: Iterable[str] = FILES) -> list[dict[str, object]]:
     """What `ihbench weights list` shows: "present", "missing" or "damaged", and where."""
-    found = []
+    states = []
     for name in names:
         weights = find_weights(name)
         paths = [folder / weights.file for folder in folders()]
         present = [path for path in paths if os.path.isfile(path)]
         right = [path for path in present if is_right(weights, path)]
-        found.append(
+        states.append(
             {
                 "name": name,
                 "file": weights.file,
@@ -179,4 +179,4 @@ def states(names: Iterable[str] = FILES) -> list[dict[str, object]]:
                 "licence": weights.licence,
             }
         )
-    return found
+    return states

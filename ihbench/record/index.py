@@ -77,10 +77,10 @@ class Entry:
         return zlib.crc32(repr(self.columns).encode("utf-8", "replace"))
 
     def matches(self, filters: Mapping[str, Any]) -> bool:
-        for name, wanted in filters.items():
+        for name, expected in filters.items():
             value = getattr(self, name)
-            if value != wanted and not (
-                name == "protocol" and value is not None and value.partition("@")[0] == wanted
+            if value != expected and not (
+                name == "protocol" and value is not None and value.partition("@")[0] == expected
             ):
                 return False
         return True
@@ -158,9 +158,9 @@ class Index:
     def _stored_results(self, entries: Iterable[Entry]) -> dict[bytes, RunResult]:
         """The runs of entries that the database holds; what it has lost meanwhile is read from the folders."""
         contents: dict[bytes, bytes] = {}
-        wanted = {entry.folder: entry for entry in entries}
+        entry_of = {entry.folder: entry for entry in entries}
         with suppress(OSError, sqlite3.Error), closing(self._open("ro")) as database:
-            for name, entry in wanted.items():
+            for name, entry in entry_of.items():
                 row = database.execute(
                     "SELECT content FROM runs WHERE folder = ? AND signature = ?", (name, entry.signature)
                 ).fetchone()
@@ -168,7 +168,7 @@ class Index:
                     contents[name] = row[0]
         return {
             name: _unpacked(self.runs / entry.name, contents.get(name)) or read_result(self.runs / entry.name)
-            for name, entry in wanted.items()
+            for name, entry in entry_of.items()
         }
 
     def _store(self, fresh: Iterable[Entry], gone: Iterable[bytes], results: Mapping[bytes, RunResult]) -> None:

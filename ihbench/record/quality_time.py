@@ -44,8 +44,8 @@ class QualityCurve:
         if not len(self.seconds):
             return np.full(np.shape(seconds), np.nan)
         times = np.asarray(seconds, np.float64)
-        found = np.interp(np.log(times), np.log(self.seconds), self.values)
-        return np.where(times < self.seconds[0], np.nan, found)
+        value = np.interp(np.log(times), np.log(self.seconds), self.values)
+        return np.where(times < self.seconds[0], np.nan, value)
 
 
 @dataclass(frozen=True)
@@ -191,8 +191,8 @@ def round_targets(curves: Sequence[QualityCurve], count: int = 3) -> list[float]
     for k in range(4):
         for mantissa in (5, 2, 1):
             step = mantissa * 10.0 ** (exponent - k)
-            rungs = [round(n * step, 12) for n in range(math.ceil(low / step + 1e-9), math.floor(high / step) + 1)]
-            if len(rungs) >= count:
-                chosen = [rungs[i] for i in spread(len(rungs), count)]
+            values = [round(n * step, 12) for n in range(math.ceil(low / step + 1e-9), math.floor(high / step) + 1)]
+            if len(values) >= count:
+                chosen = [values[i] for i in spread(len(values), count)]
                 return chosen if curves[0].higher_is_better else chosen[::-1]
     return []

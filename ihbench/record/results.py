@@ -180,12 +180,12 @@ def read_result(folder: Path) -> RunResult:
     run = RunFolder.open(folder)
     run.notice_death()
     record = run.record
-    if found := outcome_fault(record):
-        raise BadInput(f"{folder / 'run.json'}: {found}; run the same command with --force")
+    if fault := outcome_fault(record):
+        raise BadInput(f"{folder / 'run.json'}: {fault}; run the same command with --force")
     method = record.identity.method
     own, others = (_read_if_there(folder / name, score_lines) for name in ("scores.jsonl", "calibration.jsonl"))
-    if found := _mixed_up(method, own, others):
-        raise BadInput(f"{folder}: its score files are damaged ({found}); run the same command with --force")
+    if fault := _mixed_up(method, own, others):
+        raise BadInput(f"{folder}: its score files are damaged ({fault}); run the same command with --force")
     rows = mean_rows([*own, *others])
     if run.status == "done" and method not in rows:
         raise BadInput(f"{folder}: is done, but its scores are gone; run the same command with --force")
@@ -196,8 +196,8 @@ def read_result(folder: Path) -> RunResult:
         try:
             _, lines = preset_lines(file)
             mine, others = ([x for x in lines if _is_row_of(method, x.row) is own] for own in (True, False))
-            if found := _mixed_up(method, mine, others) if mine else f"no row of {method[:80]!a}":
-                raise BadInput(f"{file}: {found}")
+            if fault := _mixed_up(method, mine, others) if mine else f"no row of {method[:80]!a}":
+                raise BadInput(f"{file}: {fault}")
             presets[file.stem] = mean_rows(lines)
         except BadInput as error:
             damage.append(str(error))

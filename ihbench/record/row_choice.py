@@ -41,11 +41,11 @@ class Choice:
         """The labels (label -> method) that are wanted, in the order in which they were asked for."""
         if not self.rows:
             return list(labels)
-        found: dict[str, None] = {}
+        rows: dict[str, None] = {}
         for word in self.rows:
             named = [word] if word in labels else [label for label, method in labels.items() if method == word]
-            found |= dict.fromkeys(named)
-        return list(found)
+            rows |= dict.fromkeys(named)
+        return list(rows)
 
     def bounds(self, rows: Sequence[str]) -> list[str]:
         """The calibration rows that are wanted."""
@@ -57,7 +57,7 @@ class Choice:
     def renamed(self, labels: Iterable[str]) -> dict[str, str]:
         """Label -> its new name. Raises `BadInput` for what is no OLD=NEW of a row, and for one name on two rows."""
         labels = list(labels)
-        found: dict[str, str] = {}
+        out: dict[str, str] = {}
         for text in self.names:
             # labels have "=" in them: the longest one that the text begins with
             old = max((label for label in labels if text.startswith(f"{label}=")), key=len, default=None)
@@ -69,12 +69,12 @@ class Choice:
             new = text[len(old) + 1 :].strip()
             if not new or new in ROWS:
                 raise BadInput(f"--names {text}: expected a name after {old}= that is no bound's; give another")
-            found[old] = new
-        shown = [found.get(label, label) for label in labels]
-        twice = next((name for name in shown if shown.count(name) > 1), None) if found else None
+            out[old] = new
+        shown = [out.get(label, label) for label in labels]
+        twice = next((name for name in shown if shown.count(name) > 1), None) if out else None
         if twice is not None:
             raise BadInput(f"--names: two rows would be called {twice!r}; give each a name of its own")
-        return found
+        return out
 
     def applied(self, results: Sequence[RunResult]) -> list[RunResult]:
         """The runs with what is wanted of them, in order. Raises `BadInput` as `check` does."""
@@ -89,12 +89,12 @@ class Choice:
         labels = {label: runs[0].method for by_label in labelled for label, runs in by_label.items()}
         self.check(labels, [i.metric for i in every], [i.region for i in every])
         names = self.renamed(labels)
-        found = []
+        out = []
         for runs, by_label in zip(groups.values(), labelled, strict=True):
-            wanted = self.ordered({label: own[0].method for label, own in by_label.items()})
-            found += [self._run(run, names.get(label)) for label in wanted for run in by_label[label]]
-            found += [run for run in runs if run.status != "done" and (not self.rows or run.method in self.rows)]
-        return found
+            order = self.ordered({label: own[0].method for label, own in by_label.items()})
+            out += [self._run(run, names.get(label)) for label in order for run in by_label[label]]
+            out += [run for run in runs if run.status != "done" and (not self.rows or run.method in self.rows)]
+        return out
 
     def _run(self, run: RunResult, name: str | None) -> RunResult:
         about = run.about if name is None else replace(run.about, label=name)

@@ -24,8 +24,8 @@ def _with_views(label: str, runs: Sequence[RunResult]) -> str:
     if not missing:
         return label
     views = sum(run.about.predictions.views for run in runs if run.about.predictions is not None)
-    told = f"only {views - missing} of {views} views" if views else f"{missing} views missing"
-    return f"{label[:-1]}, {told})" if label.endswith(")") else f"{label} ({told})"
+    note = f"only {views - missing} of {views} views" if views else f"{missing} views missing"
+    return f"{label[:-1]}, {note})" if label.endswith(")") else f"{label} ({note})"
 
 
 def _label(run: RunResult, several_codes: bool) -> str:

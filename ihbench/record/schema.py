@@ -326,8 +326,8 @@ def _lines(file: Path, kind_of: Callable[[int], Any]) -> list[Any]:
     for number, text in enumerate(_content(file, LARGEST_TABLE).split("\n"), 1):
         if text.strip():
             line = _parsed(file, text, f", line {number}")
-            if found := fault(line, kind_of(len(lines))):
-                raise BadInput(f"{file}, line {number}: {found}")
+            if wrong := fault(line, kind_of(len(lines))):
+                raise BadInput(f"{file}, line {number}: {wrong}")
             lines.append(line)
     return lines
 
@@ -344,14 +344,14 @@ def _each_view_once(file: Path, lines: list[ScoreLine]) -> list[ScoreLine]:
 
 def record_fault(record: Any) -> str:
     """Where a run record of this schema version is not what it should be; "" where it is."""
-    if found := fault(record, RunRecord):
-        return found
+    if wrong := fault(record, RunRecord):
+        return wrong
     for path, value, kind in (
         ("identity.config", record["identity"]["config"], _ConfigShape),
         ("about.protocol", record["about"].get("protocol") or {}, _ProtocolShape),
     ):
-        if found := fault(value, kind):
-            return f"{path}.{found}"
+        if wrong := fault(value, kind):
+            return f"{path}.{wrong}"
     for name in ("load_average", "load_average_end"):
         if record["machine"].get(name) == []:
             return f"machine.{name} is empty"

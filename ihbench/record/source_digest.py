@@ -85,8 +85,8 @@ def _rooms_named(root: Path) -> list[Path]:
     for name, path in _files(root, ()):
         if name.endswith(".py"):
             named |= {match.groups() for match in ROOM_NAME.finditer(path.read_bytes())}
-    found = [rooms[room.decode()] / inner.decode() for room, inner in named]
-    return sorted({path if path.is_dir() else path.parent for path in found})
+    paths = [rooms[room.decode()] / inner.decode() for room, inner in named]
+    return sorted({path if path.is_dir() else path.parent for path in paths})
 
 
 def tree_digest(root: Path, leave_out: Sequence[str] = ()) -> str:

@@ -308,8 +308,8 @@ def _checked(file: Path, record: Any) -> RunRecord:
     while version < SCHEMA_VERSION:
         version, record = version + 1, MIGRATIONS[version](record)
     record = {**record, "schema_version": version}
-    if found := record_fault(record):
-        raise DamagedRecord(f"{file}: {found}; run the same command with --force")
+    if wrong := record_fault(record):
+        raise DamagedRecord(f"{file}: {wrong}; run the same command with --force")
     read: RunRecord = from_json(record, RunRecord)
     if read.identity.digest != read.digest:
         raise BadInput(f"{file}: its identity is not the one of its digest: edited, or of another run; restore it")

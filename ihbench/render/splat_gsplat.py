@@ -107,10 +107,10 @@ def check_alphas(gsplat: Any, device: torch.device) -> None:
     with torch.no_grad():
         width = 2 * PROBE_STEP + 1
         _, alpha = _composite(gsplat, splats, 1, width, torch.zeros(1, device=device), opacities)
-    found = alpha[0, ::PROBE_STEP].tolist()
-    for value, wanted in zip(found, (ALPHA_MAX, 1.05 * ALPHA_MIN, 0.0), strict=True):
-        if abs(value - wanted) > ALPHA_ERROR:
-            raise MissingPrerequisite(_other_alpha(version, f"an alpha of {value:.4g} where {wanted:.4g} belongs"))
+    measured = alpha[0, ::PROBE_STEP].tolist()
+    for value, right in zip(measured, (ALPHA_MAX, 1.05 * ALPHA_MIN, 0.0), strict=True):
+        if abs(value - right) > ALPHA_ERROR:
+            raise MissingPrerequisite(_other_alpha(version, f"an alpha of {value:.4g} where {right:.4g} belongs"))
     _measured.add((gsplat, str(device)))
 
 

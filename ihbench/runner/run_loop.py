@@ -242,11 +242,11 @@ def _changed(request: RunRequest, withheld: list[str]) -> Values:
 def _outside(request: RunRequest) -> dict[str, str]:
     """A hash of files outside the package that the configuration names, such as weights: same path, other content is
     another run. See `MethodSpec.outside_files`."""
-    found = method_spec(request.method).outside(request.config)
-    if not found:
+    paths = method_spec(request.method).outside(request.config)
+    if not paths:
         return {}
     digest = hashlib.sha256()
-    for named_path in map(Path, found):
+    for named_path in map(Path, paths):
         for path in [named_path] if named_path.is_file() else sorted(p for p in named_path.rglob("*") if p.is_file()):
             inside = path.relative_to(named_path if named_path.is_dir() else named_path.parent)
             digest.update(inside.as_posix().encode(errors="surrogateescape") + b"\0" + shipped_digest(path))

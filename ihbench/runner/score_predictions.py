@@ -48,19 +48,19 @@ def score_scene(request: ScoreRequest, source: DataSource, scene: str, progress:
     if request.prepared is not None:
         request.prepared.check(capture, body)
     opened = open_scene(capture, request.protocol)
-    found = find_predictions(request.folder, scene, opened.test_keys, request.pattern, source.scenes)
+    predictions = find_predictions(request.folder, scene, opened.test_keys, request.pattern, source.scenes)
     background = request.protocol.image.background
-    found = replace(found, alpha=find_alpha(list(found.files.values()), background, request.alpha))
+    predictions = replace(predictions, alpha=find_alpha(list(predictions.files.values()), background, request.alpha))
     code = f"{__version__}+{bench_code(request.protocol)}"
-    config = {"predictions": found.digest}
+    config = {"predictions": predictions.digest}
     identity = identity_of(request.protocol, capture, body, request.name, config, 0, code)
     files = PredictionFiles(
-        found.missing,
-        found.surplus,
-        tuple(found.notes()),
+        predictions.missing,
+        predictions.surplus,
+        tuple(predictions.notes()),
         folder=request.folder.resolve().name,
-        pattern=found.pattern,
-        alpha=found.alpha,
+        pattern=predictions.pattern,
+        alpha=predictions.alpha,
         views=len(opened.test_keys),
     )
     about = replace(
@@ -71,7 +71,7 @@ def score_scene(request: ScoreRequest, source: DataSource, scene: str, progress:
         identity,
         about,
         request.force,
-        lambda folder: _ScoreRun(request, found, opened, body, folder, progress),
+        lambda folder: _ScoreRun(request, predictions, opened, body, folder, progress),
     )
     before = result.about.predictions
     files = replace(files, doubts=() if before is None else before.doubts)

@@ -24,7 +24,7 @@ def reusable_run(runs: Path, borrower: RunFolder, state: str, free: Sequence[str
     None when there is none, or nothing is missing."""
     if state_file(borrower.path, state).is_file():
         return None
-    wanted = _key(borrower, free)
+    key = _key(borrower, free)
     for file in sorted(state_file(folder, state) for folder in Path(runs).glob("*/") if folder != borrower.path):
         if file.is_file():
             try:
@@ -33,7 +33,7 @@ def reusable_run(runs: Path, borrower: RunFolder, state: str, free: Sequence[str
                 continue  # a damaged record vouches for nothing
             there = other.record.machine
             alike = all(getattr(there, name) == getattr(here, name) for name in SAME_CLOCK)
-            if alike and other.status == "done" and _key(other, free) == wanted and _last_step(file) is not None:
+            if alike and other.status == "done" and _key(other, free) == key and _last_step(file) is not None:
                 return other
     return None
 

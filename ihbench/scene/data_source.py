@@ -127,19 +127,19 @@ def locate(protocol: Protocol, data: Path | None, scenes: tuple[str, ...]) -> Da
     """
     root = own_data(data)
     if root is not None:
-        found = open_dataset(protocol.dataset, root).subjects()
-        scenes = tuple(unicodedata.normalize("NFC", scene) if scene not in found else scene for scene in scenes)
-        known = [s for s in protocol.subjects.names if s in found] or found
-        return DataSource(protocol, root, False, _chosen(scenes, known, found, f"in {root}"))
+        names = open_dataset(protocol.dataset, root).subjects()
+        scenes = tuple(unicodedata.normalize("NFC", scene) if scene not in names else scene for scene in scenes)
+        known = [s for s in protocol.subjects.names if s in names] or names
+        return DataSource(protocol, root, False, _chosen(scenes, known, names, f"in {root}"))
     if protocol.dataset not in registry.names("stand-in"):
         raise BadInput(
             f"protocol {protocol.name}: data set {protocol.dataset!r} has no stand-in; give your copy with --data"
         )
     known = list(protocol.subjects.standin)
     cast = registry.load("stand-in", protocol.dataset).subjects(LARGEST_CAST)
-    found = [*known, *(scene for scene in scenes if scene in cast and scene not in known)]
+    names = [*known, *(scene for scene in scenes if scene in cast and scene not in known)]
     root = standin_root(protocol.dataset)
-    return DataSource(protocol, root, True, _chosen(scenes, known, found, "of the stand-in (no --data given)"))
+    return DataSource(protocol, root, True, _chosen(scenes, known, names, "of the stand-in (no --data given)"))
 
 
 def standin_root(dataset: str) -> Path:
@@ -177,8 +177,8 @@ def body_file(named: Path, gender: str) -> Path:
     """
     if not named.is_dir():
         return named
-    for wanted in (gender, "neutral"):
-        for pattern in (f"smpl_{wanted}.", f"basicmodel_{wanted}_", f"basicmodel_{wanted[0]}_"):
+    for kind in (gender, "neutral"):
+        for pattern in (f"smpl_{kind}.", f"basicmodel_{kind}_", f"basicmodel_{kind[0]}_"):
             for path in sorted(named.iterdir()):
                 if path.name.lower().startswith(pattern) and path.suffix.lower() in (".pkl", ".npz"):
                     return path
@@ -188,12 +188,12 @@ def body_file(named: Path, gender: str) -> Path:
 def wanted_frames(protocol: Protocol, standin: type) -> dict[int, list[int]]:
     """Camera index -> frames that a protocol reads of every stand-in subject."""
     n_frames, n_cameras = standin.n_frames, standin.n_cameras
-    wanted: dict[int, set[int]] = {protocol.train.camera: set()}
+    frames_of: dict[int, set[int]] = {protocol.train.camera: set()}
     for subject in standin.subjects(1):  # all of a cast have the same frames
-        wanted[protocol.train.camera] |= set(protocol.training_frames(subject, n_frames))
+        frames_of[protocol.train.camera] |= set(protocol.training_frames(subject, n_frames))
         for camera, frame, _ in protocol.test_views(subject, n_frames, n_cameras):
-            wanted.setdefault(camera, set()).add(frame)
-    return {camera: sorted(frames) for camera, frames in wanted.items()}
+            frames_of.setdefault(camera, set()).add(frame)
+    return {camera: sorted(frames) for camera, frames in frames_of.items()}
 
 
 def _chosen(scenes: tuple[str, ...], known: list[str], found: list[str], where: str) -> tuple[str, ...]:

@@ -203,8 +203,8 @@ def _full_silhouette() -> Answer:
 def _sized(size: int) -> Answer:
     """The protocol's image has another size than the photograph: the truth still scores as the truth."""
     scorer = _scorer(person(), size=size, rule="none")
-    found = *scorer.load(0).view.image.shape, _scores(scorer)[PSNR_FULL].value
-    return Answer(found, [size, size, 3, math.inf])
+    got = *scorer.load(0).view.image.shape, _scores(scorer)[PSNR_FULL].value
+    return Answer(got, [size, size, 3, math.inf])
 
 
 def _truth(change: Callable[[NDArray], NDArray]) -> Answer:
@@ -230,9 +230,9 @@ def _nan_elsewhere() -> Answer:
     spoiled = worse.copy()
     row, column = np.argwhere(~np.asarray(loaded.regions["body"]))[0]
     spoiled[row, column] = math.nan
-    clean, found = (scorer.score(loaded, image, slow=False).scores for image in (worse, spoiled))
+    clean, got = (scorer.score(loaded, image, slow=False).scores for image in (worse, spoiled))
     name = "ssim/gauss11-1.5/range1/{}/v1".format
-    return Answer([found[name("full")].value, found[name("body")].value], [math.nan, clean[name("body")].value])
+    return Answer([got[name("full")].value, got[name("body")].value], [math.nan, clean[name("body")].value])
 
 
 def _no_color() -> Answer:

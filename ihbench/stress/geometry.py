@@ -70,8 +70,8 @@ def _orthonormal() -> Answer:
     rng = np.random.default_rng(0)
     axes = rng.normal(size=(400, 3))
     axes *= (np.geomspace(1e-9, 30, 400) / np.linalg.norm(axes, axis=1))[:, None]
-    found = _rotations(axes)
-    return Answer(found @ found.swapaxes(-1, -2), np.eye(3), scale=1.0)
+    got = _rotations(axes)
+    return Answer(got @ got.swapaxes(-1, -2), np.eye(3), scale=1.0)
 
 
 def _gradient(angle: float) -> Answer:
@@ -85,9 +85,9 @@ def _gradient(angle: float) -> Answer:
     c, s = math.cos(angle), math.sin(angle)
     expected = np.array([[-s, -c, 0], [c, -s, 0], [0, 0, 0]])
     along_x = np.array([[0, 0, (1 - c) / angle if angle else 0], [0, 0, -s / angle if angle else -1.0]])
-    found = jacobian.numpy()
+    got = jacobian.numpy()
     return Answer(
-        np.concatenate([found[..., 2].ravel(), found[:2, :, 0].ravel()]),
+        np.concatenate([got[..., 2].ravel(), got[:2, :, 0].ravel()]),
         np.concatenate([expected.ravel(), along_x.ravel()]), max(1.0, angle), scale=max(1.0, angle),
     )  # fmt: skip
 
@@ -194,8 +194,8 @@ def _sliver(width: float) -> Answer:
     tip = [((Fraction(int(j)) + Fraction(1, 2) - x0) * (y2 - y0) - (x2 - x0) * (Fraction(1, 2) - y0)) / area
            for j in columns]  # fmt: skip
     condition = 64.0**2 / float(abs(area))
-    found = np.append(raster.bary[0, columns, 1], len(columns))
-    return Answer(found, [*map(float, tip), 32], condition, scale=1.0, precision=np.float32)
+    got = np.append(raster.bary[0, columns, 1], len(columns))
+    return Answer(got, [*map(float, tip), 32], condition, scale=1.0, precision=np.float32)
 
 
 def _shared_edge() -> Answer:
@@ -229,8 +229,8 @@ def _texel_coordinates() -> Answer:
     e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = np.abs(e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0])
     longest = np.maximum(np.square(e1).sum(1), np.square(e2).sum(1))
-    found = np.einsum("nk,nkc->nc", texels.bary, corners)
-    return Answer(found, texels.uv, float((longest / area).max()), scale=1.0)
+    got = np.einsum("nk,nkc->nc", texels.bary, corners)
+    return Answer(got, texels.uv, float((longest / area).max()), scale=1.0)
 
 
 def _constant_map() -> Answer:
@@ -251,11 +251,11 @@ def _projected(camera: Camera, point: tuple[float, float, float]) -> Answer:
     terms = np.abs(camera.R * np.asarray(point)).sum(1) + np.abs(camera.t)
     sizes = np.abs(np.array([float(x) for x in c]))
     condition = float((terms / np.maximum(sizes, 1e-300)).max())
-    found = camera.project(np.array(point))
+    got = camera.project(np.array(point))
     exact = np.array([float(u), float(v), float(c[2])])
     # every ratio carries the condition number of the sum it divides by
     pixels = max(abs(float(u - K[0, 2])), abs(float(v - K[1, 2])), abs(float(u)), abs(float(v)))
-    return Answer(found / [pixels, pixels, sizes[2]], exact / [pixels, pixels, sizes[2]], condition, scale=condition)
+    return Answer(got / [pixels, pixels, sizes[2]], exact / [pixels, pixels, sizes[2]], condition, scale=condition)
 
 
 def _long_lens() -> Answer:
@@ -296,9 +296,9 @@ def _strong_lens() -> Answer:
         fx * radial + 2 * p1 * fx * fy + p2 * (r2 + 2 * fx * fx),
         fy * radial + p1 * (r2 + 2 * fy * fy) + 2 * p2 * fx * fy,
     )
-    found = distort(np.array(x), np.array(y), np.array(coefficients))
+    got = distort(np.array(x), np.array(y), np.array(coefficients))
     size = abs(float(fx)) * (1 + 25 * (0.24 + 25 * (0.08 + 25 * 0.01)))
-    return Answer(found, [float(e) for e in exact], size / abs(float(exact[0])), scale=size)
+    return Answer(got, [float(e) for e in exact], size / abs(float(exact[0])), scale=size)
 
 
 def _resampled() -> Answer:

@@ -217,8 +217,8 @@ def _intervals() -> Answer:
     alone = mean_interval({"a": 3.0})
     equal = mean_interval({"a": 3.0, "b": 3.0, "c": 3.0})
     pair = paired_test({"a": 1.0, "b": 2.0}, {"a": 0.0, "b": 0.5})
-    found = [alone.low, equal.low, equal.high, pair.p, smallest_detectable_difference([0.5, 0.5, 0.5])]
-    return Answer(found, [math.nan, 3.0, 3.0, 0.5, 0.0])
+    got = [alone.low, equal.low, equal.high, pair.p, smallest_detectable_difference([0.5, 0.5, 0.5])]
+    return Answer(got, [math.nan, 3.0, 3.0, 0.5, 0.0])
 
 
 _metric = partial(Case, group="metrics")

@@ -60,25 +60,25 @@ class Flip:
 def flips(before: Mapping[str, float], after: Mapping[str, float], metric: str) -> list[Flip]:
     """The pairs that one ranking has one way round and the other the other way; ties are no flips."""
     sign = 1 if metric_of(metric.partition("/")[0]).higher_is_better else -1
-    found = []
+    flips = []
     for a, b in combinations(before, 2):
         if sign * before[a] < sign * before[b]:
             a, b = b, a
         if before[a] != before[b] and sign * after[a] < sign * after[b]:
-            found.append(Flip(metric, ((a, before[a]), (b, before[b])), (after[a], after[b])))
-    return found
+            flips.append(Flip(metric, ((a, before[a]), (b, before[b])), (after[a], after[b])))
+    return flips
 
 
 def means(frames: Sequence[Frame], preset: Preset, region: str, metric: str, background: Color) -> dict[str, float]:
     """Every contestant's mean over the frames of one metric, over a region or the preset's own first one."""
-    found = {}
+    means = {}
     for name in frames[0].images:
         scores = []
         for frame in frames:
             scored = evaluate(frame.images[name], frame.truth, frame.regions, preset, background, False, [region])
             scores.append(next(s for identity, s in scored.items() if identity.startswith(f"{metric}/")))
-        found[name] = mean_over_frames(scores).value
-    return found
+        means[name] = mean_over_frames(scores).value
+    return means
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -190,13 +190,13 @@ def compared(name: str) -> tuple[list[Flip], int]:
     """Every flip under a choice, over all metrics that both rankings have, and the number of pairs looked at."""
     before, after = _under(name)
     metrics = METRICS if before.preset.name == after.preset.name else METRICS[:2]  # released evaluators lack FLIP
-    found: list[Flip] = []
+    got: list[Flip] = []
     pairs = 0
     for metric in metrics:
         old, new = (means(r.frames, r.preset, r.region, metric, r.background) for r in (before, after))
-        found += flips(old, new, metric)
+        got += flips(old, new, metric)
         pairs += len(old) * (len(old) - 1) // 2
-    return found, pairs
+    return got, pairs
 
 
 def _ladder(name: str) -> Answer:
@@ -207,11 +207,11 @@ def _ladder(name: str) -> Answer:
 
 def _open_field(name: str) -> Answer:
     """Flips between errors of different kinds."""
-    found, pairs = compared(name)
-    if not found:
+    got, pairs = compared(name)
+    if not got:
         return Answer(0, 0, note=f"no pair of {pairs} changes places")
-    shown = "; ".join(map(str, found[:3])) + (f"; and {len(found) - 3} more" if len(found) > 3 else "")
-    return Answer(len(found), 0, note=f"the order flips under {name} for {len(found)} of {pairs} pairs: {shown}")
+    shown = "; ".join(map(str, got[:3])) + (f"; and {len(got) - 3} more" if len(got) > 3 else "")
+    return Answer(len(got), 0, note=f"the order flips under {name} for {len(got)} of {pairs} pairs: {shown}")
 
 
 LAW = "more of the same error is worse, whatever else is chosen"

@@ -37,8 +37,8 @@ def chosen_cases(groups: Sequence[str] = (), names: Sequence[str] = ()) -> list[
             raise BadInput(f"stress group {group!r}: {registry.nearest(group, known)}")
     cases = [case for case in cases if not groups or case.group in groups]
     for name in names:
-        if name not in (found := [case.name for case in cases]):
-            raise BadInput(f"stress case {name!r}: {registry.nearest(name, found)}")
+        if name not in (got := [case.name for case in cases]):
+            raise BadInput(f"stress case {name!r}: {registry.nearest(name, got)}")
     return [case for case in cases if not names or case.name in names]
 
 

@@ -83,11 +83,11 @@ def _nothing_to_move() -> Answer:
     """Gradients of a scene that is all behind the camera are zeros, one for every Gaussian."""
     import torch
 
-    found = []
+    got = []
     for backend in BACKENDS:
         leaves = _leaves(torch.tensor([[0.0, 0, -1], [0, 0, -2]]), torch.ones(2), torch.ones(2, 3))
-        found += [g.flatten() for g in _gradients(leaves, camera(), backend)]
-    return Answer(torch.cat(found).numpy(), 0.0)
+        got += [g.flatten() for g in _gradients(leaves, camera(), backend)]
+    return Answer(torch.cat(got).numpy(), 0.0)
 
 
 def _leaves(*tensors: Tensor) -> list[Tensor]:
@@ -133,8 +133,8 @@ def _thin_stack(count: int) -> Answer:
 def _coincident(gap: float) -> Answer:
     """Two Gaussians at one depth, or nearer to each other than float32 can tell: the lower index is in front."""
     means = [[0.0, 0.0, 2.0 + gap], [0.0, 0.0, 2.0]]
-    found = np.stack(draw(means, [0.3, 0.3], [[1.0, 0, 0], [0, 0, 1.0]]))
-    return Answer(found[:, 10, 12, 0], ALPHA_MAX + (1 - ALPHA_MAX) ** 2)
+    got = np.stack(draw(means, [0.3, 0.3], [[1.0, 0, 0], [0, 0, 1.0]]))
+    return Answer(got[:, 10, 12, 0], ALPHA_MAX + (1 - ALPHA_MAX) ** 2)
 
 
 def _one_bad(field: int, bad: float) -> Answer:
@@ -155,16 +155,16 @@ def _bad_gradient() -> Answer:
 
     means, scales, colors = (torch.from_numpy(x) for x in _cloud(40))
     others = torch.tensor([k for k in range(40) if k != 7])
-    found, expected = [], []
+    got, expected = [], []
     for backend in BACKENDS:
         spoiled = means.clone()
         spoiled[7, 0] = math.nan
         gradients = _gradients(_leaves(spoiled, scales, colors), camera(), backend)
         alone = _gradients(_leaves(means[others], scales[others], colors[others]), camera(), backend)
         for g, a in zip(gradients, alone, strict=True):
-            found += [g[7].flatten(), g[others].flatten()]
+            got += [g[7].flatten(), g[others].flatten()]
             expected += [torch.zeros_like(g[7]).flatten(), a.flatten()]
-    return Answer(torch.cat(found).numpy(), torch.cat(expected).numpy())
+    return Answer(torch.cat(got).numpy(), torch.cat(expected).numpy())
 
 
 def _cloud(count: int, seed: int = 0) -> tuple[NDArray, NDArray, NDArray]:
@@ -196,15 +196,15 @@ def _threads() -> Answer:
     import torch
 
     leaves = [torch.from_numpy(x) for x in _cloud(300)]
-    before, found = torch.get_num_threads(), []
+    before, got = torch.get_num_threads(), []
     try:
         for threads in (1, 2):
             torch.set_num_threads(threads)
             gradients = _gradients(_leaves(*leaves), camera(70, 50), "numba")
-            found.append(torch.cat([g.flatten() for g in gradients]).numpy())
+            got.append(torch.cat([g.flatten() for g in gradients]).numpy())
     finally:
         torch.set_num_threads(before)
-    return Answer(found[0], found[1])
+    return Answer(got[0], got[1])
 
 
 def _hdr() -> Answer:
@@ -229,8 +229,8 @@ def _half() -> Answer:
 def _white_on_black() -> Answer:
     """What a white Gaussian leaves on black is alpha."""
     means, scales, colors = _cloud(60)
-    found = np.stack(draw(means, scales, np.ones_like(colors), background=(0.0, 0.0, 0.0)))
-    return Answer(found[..., :3], found[..., 3:])
+    got = np.stack(draw(means, scales, np.ones_like(colors), background=(0.0, 0.0, 0.0)))
+    return Answer(got[..., :3], got[..., 3:])
 
 
 def _far_world() -> Answer:
@@ -259,24 +259,24 @@ def _saturated_gradient() -> Answer:
 
     from ihbench.render.splat import render_gaussians
 
-    view, found = camera(1, 1), []
+    view, got = camera(1, 1), []
     for backend in BACKENDS:
         leaves = _leaves(torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([5.0]), torch.tensor([[0.2, 0.4, 0.6]]))
         rgb, _ = render_gaussians(leaves[0], leaves[1], leaves[2], view, backend=backend)
         rgb.sum().backward()
-        found.append(torch.cat([g.grad.flatten() for g in leaves if g.grad is not None]).double().numpy())
-    return Answer(np.stack(found), [0, 0, 0, 0, ALPHA_MAX, ALPHA_MAX, ALPHA_MAX])
+        got.append(torch.cat([g.grad.flatten() for g in leaves if g.grad is not None]).double().numpy())
+    return Answer(np.stack(got), [0, 0, 0, 0, ALPHA_MAX, ALPHA_MAX, ALPHA_MAX])
 
 
 def _no_scale_gradient() -> Answer:
     """At scale 0 only the low-pass is drawn; its derivative along the scale is 0 and not 0/0."""
     import torch
 
-    found = []
+    got = []
     for backend in BACKENDS:
         leaves = _leaves(torch.tensor([[0.0, 0.0, 2.0]]), torch.zeros(1), torch.ones(1, 3) / 2)
-        found.append(_gradients(leaves, camera(), backend)[1].numpy())
-    return Answer(np.stack(found), 0.0)
+        got.append(_gradients(leaves, camera(), backend)[1].numpy())
+    return Answer(np.stack(got), 0.0)
 
 
 def _distorted() -> Answer:

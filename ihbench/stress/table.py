@@ -49,8 +49,8 @@ def summary(outcomes: Sequence[Outcome]) -> str:
     verdicts = Counter(outcome.verdict for outcome in outcomes)
     groups = Counter(outcome.case.group for outcome in outcomes)
     counts = ", ".join(f"{group} {count}" for group, count in groups.items())
-    told = f"{verdicts['passed']} passed, {verdicts['known']} known to fail, {verdicts['failed']} failed"
-    return f"{len(outcomes)} cases ({counts}): {told}"
+    text = f"{verdicts['passed']} passed, {verdicts['known']} known to fail, {verdicts['failed']} failed"
+    return f"{len(outcomes)} cases ({counts}): {text}"
 
 
 def _cells(outcome: Outcome) -> tuple[str, ...]:

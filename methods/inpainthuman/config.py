@@ -144,10 +144,10 @@ PROFILES = {"quick": QUICK, "paper": PAPER}
 
 def leave_out(config: InpaintHumanConfig, scene: SceneMeasure) -> list[Omission]:
     """What this scene does not need of this configuration (see `ihbench.scene.plan`)."""
-    found = []
+    out = []
     if config.pose_residual and scene.motion_deg < STATIC_DEG:
         reason = f"no joint turns more than {scene.motion_deg:.1f}° over the training frames (limit {STATIC_DEG}°)"
-        found.append(Omission("pose_residual", False, reason, _both_fits(RESIDUAL_SHARE)))
+        out.append(Omission("pose_residual", False, reason, _both_fits(RESIDUAL_SHARE)))
     useful = tuple(r for r in config.levels if scene.texel_mm(r) * FINEST_LEVEL >= scene.pixel_mm)
     useful = useful or (min(config.levels),)
     if useful != config.levels:
@@ -155,7 +155,7 @@ def leave_out(config: InpaintHumanConfig, scene: SceneMeasure) -> list[Omission]
             f"a pixel covers {scene.pixel_mm:.1f} mm of the body; levels {config.levels} go down to "
             f"{scene.texel_mm(max(config.levels)):.1f} mm"
         )
-        found.append(Omission("levels", useful, reason, _both_fits(LEVEL_SHARE * (len(config.levels) - len(useful)))))
+        out.append(Omission("levels", useful, reason, _both_fits(LEVEL_SHARE * (len(config.levels) - len(useful)))))
     texels = config.texels
     while texels > LEAST_TEXELS and scene.texel_mm(texels // 2) * POINTS_A_PIXEL <= scene.pixel_mm:
         texels //= 2
@@ -165,10 +165,10 @@ def leave_out(config: InpaintHumanConfig, scene: SceneMeasure) -> list[Omission]
             f"{scene.texel_mm(config.texels):.1f} mm apart"
         )
         share = POINTS_SHARE * (1 - (texels / config.texels) ** 2)
-        found.append(Omission("texels", texels, reason, _both_fits(share)))
+        out.append(Omission("texels", texels, reason, _both_fits(share)))
     inpaint = config.inpaint
     if not config.paints or inpaint.always or inpaint.context != "seen" or inpaint.turntable:
-        return found  # a turntable shows all from the front
+        return out  # a turntable shows all from the front
     if scene.hidden_texels <= NOTHING_HIDDEN:
         if _one_fit_does(config):
             reason = (
@@ -176,14 +176,14 @@ def leave_out(config: InpaintHumanConfig, scene: SceneMeasure) -> list[Omission]
                 "and one fit with stage 3's SSIM does for both"
             )
             spares = {"fit/stage1": -ONE_FIT_SHARE, "fit/stage2": 1.0, "fit/stage3": 1.0}
-            found.append(Omission("one_fit", True, reason, spares))
+            out.append(Omission("one_fit", True, reason, spares))
     elif inpaint.facing < GLANCING and scene.never_seen_texels > PART_TURN:
         reason = (
             f"{scene.never_seen_texels:.0%} of the surface never faces the camera: what is beside it is seen edge-on "
             "and few pixels would say what it looks like from the front"
         )
-        found.append(Omission("inpaint.facing", GLANCING, reason))
-    return found
+        out.append(Omission("inpaint.facing", GLANCING, reason))
+    return out
 
 
 def _one_fit_does(config: InpaintHumanConfig) -> bool:
@@ -204,13 +204,13 @@ def outside_files(config: InpaintHumanConfig) -> list[Path]:
     inpaint = config.inpaint
     if not config.paints:
         return []
-    found = []
+    paths = []
     if inpaint.uses_diffusion:
-        found += [_folder(name) for name in (inpaint.weights, inpaint.control_weights) if name]
+        paths += [_folder(name) for name in (inpaint.weights, inpaint.control_weights) if name]
     if inpaint.silhouette == "sam":
-        found.append(_folder(inpaint.sam_weights))
-    found.append(_trunk(config.refine))
-    return [path for path in found if path is not None]
+        paths.append(_folder(inpaint.sam_weights))
+    paths.append(_trunk(config.refine))
+    return [path for path in paths if path is not None]
 
 
 def _trunk(refine: RefineConfig) -> Path | None:

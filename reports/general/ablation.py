@@ -33,8 +33,8 @@ def write(suite: AblationSuite, found: Found) -> tuple[list[Block], dict[str, An
     blocks: list[Block] = [Heading(2, f"Ablation: {suite.title}")]
     tables = []
     for protocol, cells in protocols.items():
-        told, numbers = _table(suite, protocol, cells)
-        blocks += told
+        tables_of, numbers = _table(suite, protocol, cells)
+        blocks += tables_of
         tables.append(numbers)
     if len(tables) > 1:
         blocks += _severities(suite, tables)
@@ -90,19 +90,19 @@ def _table(suite: AblationSuite, protocol: str, cells: Found) -> tuple[list[Bloc
     blocks.append(Table(("rung", "scenes", "runs", *titles), tuple(lines)))
     timed = grouped((variant, run) for variant, having in runs.items() for run in having if run.timed)
     blocks += bullets([*_left_out(runs), *clock_notes(timed)])
-    told, compared = _comparisons(suite.comparisons, runs, columns)
+    more, compared = _comparisons(suite.comparisons, runs, columns)
     if quoted:
         quoted_from = "The paper's numbers are quoted: its own data, whole images, LPIPS* = 1000 × LPIPS."
         blocks.append(Paragraph(quoted_from))
-    if told:
-        blocks += [Paragraph("What each component is worth (paired over scenes, mean over seeds):"), *told]
+    if more:
+        blocks += [Paragraph("What each component is worth (paired over scenes, mean over seeds):"), *more]
     return blocks, {"protocol": protocol, "headline": headline, "rungs": variants, "comparisons": compared}
 
 
 def _omissions(runs: Sequence[RunResult]) -> dict[str, int]:
     """What the plan left out -> in how many of the runs."""
-    told = [f"{field} → {_plain_text(value)}" for run in runs for field, value in run.planned.items()]
-    return {text: told.count(text) for text in dict.fromkeys(told)}
+    texts = [f"{field} → {_plain_text(value)}" for run in runs for field, value in run.planned.items()]
+    return {text: texts.count(text) for text in dict.fromkeys(texts)}
 
 
 def _left_out(runs: Mapping[str, Sequence[RunResult]]) -> list[str]:
@@ -118,40 +118,40 @@ def _left_out(runs: Mapping[str, Sequence[RunResult]]) -> list[str]:
 def _columns(runs: Sequence[RunResult], headline: str) -> list[Identity]:
     """PSNR of the headline region and of what training showed of the surface, then the other metrics' headline."""
     having = list(dict.fromkeys(i for run in runs for i, mean in run.own.items() if not mean.absent))
-    found = [i for i in having if i.region == headline]
-    first = [i for i in found if i.metric == "psnr"]
+    identities = [i for i in having if i.region == headline]
+    first = [i for i in identities if i.metric == "psnr"]
     surface = [
         i for region in REGIONS for i in having
         if i.metric == "psnr" and i.region == region and i not in first
     ]  # fmt: skip
-    return [*first, *surface, *(i for i in found if i not in first)]
+    return [*first, *surface, *(i for i in identities if i not in first)]
 
 
 def _comparisons(
     wanted: Sequence[Comparison], runs: Mapping[str, Sequence[RunResult]], columns: Sequence[Identity]
 ) -> tuple[list[Block], list[dict[str, Any]]]:
     """A table of differences, p adjusted over a column's comparisons; and the numbers."""
-    found: list[dict[str, Any]] = []
+    rows: list[dict[str, Any]] = []
     for comparison in wanted:
         before, after = _of_both(runs[comparison.without], runs[comparison.having])
         row: dict[str, Any] = {"what": comparison.what, "without": comparison.without, "with": comparison.having}
         row["scores"] = {str(i): _paired(per_scene(after, i), per_scene(before, i)) for i in columns}
         alike = one_clock([*before, *after])
         row["fit_seconds"] = _more_seconds(after, before) if alike else None
-        found.append(row)
+        rows.append(row)
     impossible = []
     for i in map(str, columns):
-        tested = [row["scores"][i] for row in found if row["scores"][i] is not None and row["scores"][i]["n"] > 1]
+        tested = [row["scores"][i] for row in rows if row["scores"][i] is not None and row["scores"][i]["n"] > 1]
         for pair, p in zip(tested, holm([pair["p"] for pair in tested]), strict=True):
             pair["p_adjusted"] = p
         if tested:  # the smallest p is multiplied by the number of tests
             impossible.append(min(len(tested) * min(pair["smallest_p"] for pair in tested), 1.0))
-    found = [row for row in found if any(row["scores"].values())]
-    if not found:
+    rows = [row for row in rows if any(row["scores"].values())]
+    if not rows:
         return [], []
     titles = [i.display.head(i.region) for i in columns]
     lines: list[tuple[Words, ...]] = []
-    for row in found:
+    for row in rows:
         n = max(pair["n"] for pair in row["scores"].values() if pair)
         cells = [_difference(row["scores"][str(i)], i.display) for i in columns]
         cells.append(_seconds_text(row["fit_seconds"]))
@@ -165,7 +165,7 @@ def _comparisons(
             )
     else:
         said = "One scene: differences have no interval and no test."
-    return [Table(("component", "scenes", *titles, "fit s"), tuple(lines)), Paragraph(said)], found
+    return [Table(("component", "scenes", *titles, "fit s"), tuple(lines)), Paragraph(said)], rows
 
 
 def _of_both(a: Sequence[RunResult], b: Sequence[RunResult]) -> tuple[list[RunResult], list[RunResult]]:

@@ -44,7 +44,7 @@ def configurations(runs: Sequence[RunResult], across: bool = False) -> list[Conf
     """One for each row of the tables of seconds. With `across`, runs of several profiles and image sizes stand side
     by side, and these count as switches."""
     groups: dict[str, list[RunResult]] = by_machine(runs)
-    found = []
+    configurations = []
     for label, group in groups.items():
         parts: dict[tuple[str, ...], list[RunResult]] = {}
         for run in group:
@@ -61,8 +61,8 @@ def configurations(runs: Sequence[RunResult], across: bool = False) -> list[Conf
                 if "size" in first.identity.changes:
                     changed[IMAGE_SIZE] = str(size)
                 name += f" [{first.identity.profile}, {size} px]"
-            found.append(Configuration(name, first.method, changed, settings, tuple(part)))
-    return found
+            configurations.append(Configuration(name, first.method, changed, settings, tuple(part)))
+    return configurations
 
 
 def sweeps(configs: Sequence[Configuration]) -> list[Sweep]:
@@ -70,7 +70,7 @@ def sweeps(configs: Sequence[Configuration]) -> list[Sweep]:
 
     A configuration without the switch among its changes takes part with the profile's value.
     """
-    found = []
+    sweeps = []
     for method in dict.fromkeys(c.method for c in configs):
         mine = [c for c in configs if c.method == method]
         for axis in dict.fromkeys(name for c in mine for name in c.changed):
@@ -84,8 +84,8 @@ def sweeps(configs: Sequence[Configuration]) -> list[Sweep]:
                     continue
                 valued.sort(key=lambda pair: _rank(pair[0]) or ())
                 if len({_rank(value) for value, _ in valued}) >= 2:
-                    found.append(Sweep(axis, dict(others), tuple(valued)))
-    return found
+                    sweeps.append(Sweep(axis, dict(others), tuple(valued)))
+    return sweeps
 
 
 def short_value(value: Any) -> str:

@@ -62,23 +62,23 @@ def score_tables(results: Sequence[RunResult], presets: Sequence[str] = ()) -> l
     """What a paper takes from a report: for each protocol, profile and kind of data one table of all metrics and
     regions, and one for each further preset, titled. Raises `BadInput` where no run is done."""
     groups = by_group(result for result in results if result.status == "done")
-    found: list[Table] = []
+    score_tables: list[Table] = []
     for (protocol, digest, profile, data), runs in groups.items():
         headline = runs[0].headline
         title = f"{protocol} ({digest}), {profile} profile, {data}"
         columns = [i for i in dict.fromkeys(i for r in runs for i in r.rows[r.method]) if _has_a_number(runs, i)]
         if columns:
             table = _table(runs, columns, headline, with_metric=True)
-            found.append(replace(table, title=title))
+            score_tables.append(replace(table, title=title))
         for preset in presets:
             scored = _under(preset, runs)
             columns = _preset_columns(scored)
             if columns:
                 table = _table(scored, columns, headline, with_metric=True)
-                found.append(replace(table, title=f"{title}, {preset}"))
-    if not found:
+                score_tables.append(replace(table, title=f"{title}, {preset}"))
+    if not score_tables:
         raise BadInput("--fragment: no run that is done has a number here; there is no table to write")
-    return found
+    return score_tables
 
 
 def _under(preset: str, runs: Sequence[RunResult]) -> list[RunResult]:
@@ -118,8 +118,8 @@ def _group(runs: list[RunResult], presets: Sequence[str], targets: Sequence[Targ
             first = metric == identities[0].metric
             blocks.append(_table(done, columns, headline, with_costs=first))
     scenes = ", ".join(sorted({run.scene for run in done}))
-    told = f"Mean over test views of a scene, then over scenes ({scenes}). Headline region: {headline}."
-    blocks.append(Paragraph(told))
+    note = f"Mean over test views of a scene, then over scenes ({scenes}). Headline region: {headline}."
+    blocks.append(Paragraph(note))
     blocks += _definitions(identities)
     present = [row for row in ROWS if any(row in run.rows for run in done)]
     blocks += bullets([*(f"{row}: {DESCRIPTIONS[row]}" for row in present), *_remarks(done)])
@@ -227,8 +227,8 @@ def _remarks(runs: list[RunResult]) -> list[str]:
             what = f"{o.field} → {o.value}: {o.reason}"
             omitted.setdefault((labels[id(run)], what), []).append(run.scene)
         files = run.about.predictions
-        told = () if files is None else (*files.notes, *files.doubts)
-        notes += [f"{run.method} on {run.scene}: {note}" for note in told]
+        remarks = () if files is None else (*files.notes, *files.doubts)
+        notes += [f"{run.method} on {run.scene}: {note}" for note in remarks]
         notes += [f"{run.method} on {run.scene}: not shown: {damage}" for damage in run.damage]
     for (label, what), scenes in omitted.items():
         notes.append(f"left out, {label} on {', '.join(dict.fromkeys(scenes))}: {what}")

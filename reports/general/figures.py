@@ -89,20 +89,20 @@ def _work_precision(
     configs: Sequence[Configuration], headline: str, path: Path, title: str, about: str
 ) -> list[tuple[Path, str]]:
     configs, scenes = comparable(configs)
-    found: dict[Identity, list[WorkPoint]] = {}
+    panels: dict[Identity, list[WorkPoint]] = {}
     for i in dict.fromkeys(i for c in configs for run in c.runs for i in run.own):
-        if i.region != headline or i.metric not in METRICS or len(found) == DRAWN:
+        if i.region != headline or i.metric not in METRICS or len(panels) == DRAWN:
             continue
         points = [p for p in work_points(configs, i, scenes) if p.seconds.value > 0 and p.error.value > 0]
         if points:
-            found[i] = points
-    if not found:
+            panels[i] = points
+    if not panels:
         return []
-    drawn, axes = diagram.figure(len(found), width=5.0, height=5.2)
+    drawn, axes = diagram.figure(len(panels), width=5.0, height=5.2)
     rows: list[dict[str, object]] = []
     handles: dict[str, Artist] = {}
     labels: list[tuple[Axes, list[diagram.Label], list[list[tuple[float, float]]]]] = []
-    for panel, (identity, points) in zip(axes, found.items(), strict=True):
+    for panel, (identity, points) in zip(axes, panels.items(), strict=True):
         front = pareto_set([p.seconds.value for p in points], [p.error.value for p in points])
         diagram.logarithmic(panel, _shown([p.seconds for p in points]), _shown([p.error for p in points]))
         labels.append((panel, *_points(panel, points, handles)))
@@ -256,19 +256,19 @@ def _curve_panel(
     rows: list[dict[str, Any]] = []
     for k, c in enumerate(configs):
         colour, mark = diagram.COLOURS[k % len(diagram.COLOURS)], diagram.MARKS[k % len(diagram.MARKS)]
-        found = curves(c, identity)
+        lines_of = curves(c, identity)
         by_run = {(run.scene, run.seed): [run] for run in c.runs}
         points = [
             {"kind": "checkpoint", "configuration": c.label, "scene": scene, "seed": seed, "identity": str(identity),
              "seconds": float(t), "value": float(v), "test_views": standing(by_run[scene, seed]),
              "error": error_of(metric, float(v))}
-            for (scene, seed), curve in found.items()
+            for (scene, seed), curve in lines_of.items()
             for t, v in zip(curve.seconds, curve.values, strict=True)
             if error_of(metric, float(v)) > 0
         ]  # fmt: skip
         if not points:
             continue
-        mean = _mean_curve(found)
+        mean = _mean_curve(lines_of)
         errors = [error_of(metric, value) for _, value, _, _ in mean]
         dash = diagram.DASHES[k // len(diagram.COLOURS) % len(diagram.DASHES)]
         (line,) = panel.plot([t for t, *_ in mean], errors, color=colour, lw=1.8, ls=dash, zorder=3)

@@ -43,8 +43,8 @@ def write(results: Sequence[RunResult], left_out: Sequence[str] = (), width: int
     if len(sheets) > SHOWN:
         lines.append(f"contact sheet: {len(sheets) - SHOWN} more in the run folders")
     if left_out:
-        told = f"left out: {len(left_out)} folder{'s' * (len(left_out) > 1)}; --full says which and why"
-        lines += _wrapped(told, width)
+        note = f"left out: {len(left_out)} folder{'s' * (len(left_out) > 1)}; --full says which and why"
+        lines += _wrapped(note, width)
     lines += _wrapped("all regions, seconds, notes and tests: --full", width)
     return "\n".join(lines) + "\n"
 
@@ -56,8 +56,8 @@ def _group(runs: Sequence[RunResult], width: int) -> list[str]:
     if not done:
         return title
     headline = done[0].headline
-    found = dict.fromkeys(i for run in done for i in run.own)
-    in_headline = [i for i in found if i.region == headline]
+    identities = dict.fromkeys(i for run in done for i in run.own)
+    in_headline = [i for i in identities if i.region == headline]
     own = [run.own for run in done]
     present = [i for i in in_headline if any(i in means and not means[i].absent for means in own)]
     rows = _rows(done, present)
@@ -76,13 +76,13 @@ def _group(runs: Sequence[RunResult], width: int) -> list[str]:
     absent = [i.display.title for i in in_headline if i not in present]
     absent += [heads[k] for k in range(len(heads)) if k not in kept]
     scenes = sorted({run.scene for run in done})
-    told = f"mean over test views of {', '.join(scenes) if len(scenes) <= SHOWN else f'{len(scenes)} scenes'}"
-    told += f"; not shown: {', '.join(absent)}" if absent else ""
+    note = f"mean over test views of {', '.join(scenes) if len(scenes) <= SHOWN else f'{len(scenes)} scenes'}"
+    note += f"; not shown: {', '.join(absent)}" if absent else ""
     reasons = dict.fromkeys(
         means[i].reason for i in in_headline if i not in present for means in own if i in means and means[i].reason
     )
     why = [line for reason in reasons for line in _wrapped(reason, width)]
-    return [*title, "", lines[0], "-" * max(map(cell_len, lines)), *lines[1:], "", *_wrapped(told, width), *why]
+    return [*title, "", lines[0], "-" * max(map(cell_len, lines)), *lines[1:], "", *_wrapped(note, width), *why]
 
 
 def _rows(done: Sequence[RunResult], identities: Sequence[Identity]) -> list[tuple[str, list[str]]]:

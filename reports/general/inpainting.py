@@ -43,19 +43,19 @@ class Painted:
 def inpainting_section(labelled: Mapping[str, Sequence[RunResult]]) -> list[Block]:
     """A table over the runs that painted something; nothing without any."""
     painted = {label: [e for run in runs for e in _painted(run)] for label, runs in labelled.items()}
-    found: dict[str, list[Painted]] = {
+    events_of: dict[str, list[Painted]] = {
         label: [from_json(e, Painted) for e in events if not fault(e, Painted)] for label, events in painted.items()
     }
     notes: list[Words] = [
-        f"not in the means of {label}: {len(events) - len(found[label])} whose record of it is damaged"
+        f"not in the means of {label}: {len(events) - len(events_of[label])} whose record of it is damaged"
         for label, events in painted.items()
-        if len(events) > len(found[label])
+        if len(events) > len(events_of[label])
     ]
-    found = {label: events for label, events in found.items() if events}
-    if not found:
+    events_of = {label: events for label, events in events_of.items() if events}
+    if not events_of:
         return [Heading(3, "Inpainting"), *bullets(notes)] if notes else []
     rows: list[tuple[Words, ...]] = []
-    for label, events in found.items():
+    for label, events in events_of.items():
         drifts, flickers = [event.identity_drift for event in events], [event.flicker for event in events]
         cells = [
             str(len(events)),

@@ -114,13 +114,13 @@ def _check(pairs: Sequence[tuple[RunResult, Account]]) -> list[Block]:
     shares = [a.unnamed_share for _, a in pairs]
     good = sum(a.adds_up for _, a in pairs)
     stamped = [a for _, a in pairs if not math.isnan(a.stamped)]
-    told = (
+    note = (
         f"Named stages add up to the wall clock within {TOLERANCE:.0%} in {good} of {len(pairs)} runs; the rest, "
         f"{min(shares):.1%} to {max(shares):.1%}, is in its own row. Indented stages are parts of the one above."
     )
     if stamped:
         apart = max(abs(a.wall - a.stamped) for a in stamped)
-        told += (
+        note += (
             f" The record's own time stamps (whole seconds) are at most {apart:.1f} s away from the ledger's wall "
             f"clock in the {len(stamped)} runs that went through in one go."
         )
@@ -134,7 +134,7 @@ def _check(pairs: Sequence[tuple[RunResult, Account]]) -> list[Block]:
             notes.append(f"does not add up: {who}: {what} of {a.wall:.0f} s")
         if not a.agrees:
             notes.append(f"clocks disagree: {who}: ledger {a.wall:.0f} s, time stamps {a.stamped:.0f} s")
-    return [Paragraph(told), *bullets(notes)]
+    return [Paragraph(note), *bullets(notes)]
 
 
 def _stamped(record: RunRecord, ledger: LedgerState, scored_again: bool) -> float:

@@ -70,7 +70,7 @@ def comparable(configs: Sequence[Configuration]) -> tuple[list[Configuration], l
 
 def work_points(configs: Sequence[Configuration], identity: Identity, scenes: Sequence[str]) -> list[WorkPoint]:
     """Seconds and error of every configuration over these scenes; those without a finite number are left out."""
-    found = []
+    work_points = []
     for c in configs:
         runs = [run for run in c.runs if run.scene in scenes]
         values = per_scene(runs, identity)
@@ -80,8 +80,8 @@ def work_points(configs: Sequence[Configuration], identity: Identity, scenes: Se
         metric = identity.metric
         ends = sorted(error_of(metric, end) for end in (value.low, value.high))
         error = Interval(error_of(metric, value.value), ends[0], ends[1], value.level, value.n, value.method)
-        found.append(WorkPoint(c, seconds_interval(runs), value, error))
-    return found
+        work_points.append(WorkPoint(c, seconds_interval(runs), value, error))
+    return work_points
 
 
 def seconds_interval(runs: Sequence[RunResult], key: str = "fit_seconds") -> Interval:
@@ -93,8 +93,8 @@ def seconds_interval(runs: Sequence[RunResult], key: str = "fit_seconds") -> Int
 
 def curves(configuration: Configuration, identity: Identity) -> dict[tuple[str, int], QualityCurve]:
     """(scene, seed) -> the run's curve; runs without such a curve are left out."""
-    found = {(run.scene, run.seed): curve_of(run.curve, identity) for run in configuration.runs}
-    return {run: curve for run, curve in found.items() if len(curve.values)}
+    curve_by_run = {(run.scene, run.seed): curve_of(run.curve, identity) for run in configuration.runs}
+    return {run: curve for run, curve in curve_by_run.items() if len(curve.values)}
 
 
 def curve_identities(configs: Sequence[Configuration]) -> list[Identity]:
@@ -110,14 +110,12 @@ def times_to(target: float, found: Mapping[tuple[str, int], QualityCurve], scene
 
 def standing(runs: Iterable[RunResult]) -> str:
     """On how many of how many test views the curves of these runs stand: "6 of 55", "all 4"."""
-    found: set[tuple[int, int]] = set()
+    rows: set[tuple[int, int]] = set()
     for run in runs:
         tested = max((mean.total for mean in run.own.values()), default=0)
         for point in run.curve:
-            found.add((point.views, point.of or tested))
-    texts = [
-        f"all {of}" if 0 < views == of else f"{views or 'some'} of {of or 'more'}" for views, of in sorted(found)
-    ]
+            rows.add((point.views, point.of or tested))
+    texts = [f"all {of}" if 0 < views == of else f"{views or 'some'} of {of or 'more'}" for views, of in sorted(rows)]
     return " or ".join(texts)
 
 
@@ -163,10 +161,10 @@ def across_sizes_section(results: Sequence[RunResult]) -> list[Block]:
 def same_protocol(results: Sequence[RunResult]) -> dict[tuple[str, str], list[RunResult]]:
     """(protocol, data) -> finished runs under it, whatever their profile and image size, where there are several."""
     timed = (run for run in results if run.status == "done" and run.timed)
-    found = grouped(((run.identity.protocol_without("size"), run.data), run) for run in timed)
+    groups = grouped(((run.identity.protocol_without("size"), run.data), run) for run in timed)
     return {
         key: runs
-        for key, runs in found.items()
+        for key, runs in groups.items()
         if len({(run.identity.protocol, run.identity.profile) for run in runs}) > 1
     }
 
@@ -201,15 +199,15 @@ def _cost_table(configs: Sequence[Configuration], identities: Sequence[Identity]
     kinds = sorted({interval.method for interval in known if math.isfinite(interval.low)})
     head = ["method", "runs", f"fit s [{SPREAD}]" if kinds else "fit s", "total s", "peak MB"]
     head += ["GPU MB"] if on_gpu else []
-    told = (
+    note = (
         f"Region {headline}, {len(scenes)} scene{'s' if len(scenes) > 1 else ''} that all these rows have. The fit "
         "clock stands still while checkpoints are scored and states are saved; total s is the whole run. Pareto: by "
         "these means no other row is as fast and better in this metric."
     )
     lacking = [c.label for c in all_rows if c not in configs]
-    told += f" Not here, because they lack some of these scenes: {'; '.join(lacking)}." if lacking else ""
-    told += f" Intervals: {'; '.join(kinds)}." if kinds else ""
-    return [Table((*head, *metrics, "Pareto"), tuple(rows)), Paragraph(told)]
+    note += f" Not here, because they lack some of these scenes: {'; '.join(lacking)}." if lacking else ""
+    note += f" Intervals: {'; '.join(kinds)}." if kinds else ""
+    return [Table((*head, *metrics, "Pareto"), tuple(rows)), Paragraph(note)]
 
 
 def _quality_times(configs: Sequence[Configuration], headline: str, targets: Sequence[Target]) -> list[Block]:
@@ -243,9 +241,9 @@ def _time_table(
     missing: list[Words] = []
     for target in targets:
         region = target.region or headline
-        found = [i for i in known if (i.metric, i.region) == (target.metric, region)]
-        if found:
-            columns.append((target, found[0]))
+        identities = [i for i in known if (i.metric, i.region) == (target.metric, region)]
+        if identities:
+            columns.append((target, identities[0]))
         else:
             missing.append(f"no curve of {target.metric} in {region}: scored at the end of a run only, or not at all")
     if not columns or not scenes:
@@ -257,7 +255,7 @@ def _time_table(
         where = "" if i.region == headline else f" {i.region}"
         unit = " dB" if metric.unit == "dB" else ""
         head.append(f"{metric.title}{where} {sign} {target.value * metric.scale:g}{unit}")
-    told = (
+    note = (
         f"Seconds of fitting until the quality was first reached on {views} test views (region "
         f"{headline} where none is named); where the table over all views says otherwise, the cell says so. Median "
         "over scenes of the median over seeds, in brackets the order "
@@ -268,7 +266,7 @@ def _time_table(
     return [
         Heading(3, f"Time to quality, on {views} test views"),
         Table(tuple(head), tuple(rows)),
-        Paragraph(told),
+        Paragraph(note),
         *bullets(missing),
     ]
 
@@ -283,8 +281,8 @@ def _round_ones(configs: Sequence[Configuration], identity: Identity) -> list[fl
 
 def _time_cell(configuration: Configuration, target: float, identity: Identity, scenes: Sequence[str]) -> str:
     """Median seconds; with the views that it stands on wherever the table over all views says something else."""
-    found, metric = curves(configuration, identity), identity.display
-    times = times_to(target, found, scenes)
+    seconds, metric = curves(configuration, identity), identity.display
+    times = times_to(target, seconds, scenes)
     if not times:
         return "—"
     views = f"on {standing(run for run in configuration.runs if run.scene in times)} views"
@@ -296,7 +294,7 @@ def _time_cell(configuration: Configuration, target: float, identity: Identity, 
         says = f"; the table has {of_all}"
     reached = sum(math.isfinite(value) for value in times.values())
     if not reached:
-        values = [curve.best for (scene, _), curve in found.items() if scene in times]
+        values = [curve.best for (scene, _), curve in seconds.items() if scene in times]
         best = max(values) if metric.higher_is_better else min(values)
         return f"never (best {metric.text(best)} {views}{says})"
     interval = median_interval(times, LEVEL)
@@ -318,13 +316,13 @@ def _end_table(
             rows.append((c.label, *(cell or "as in the table" for cell in cells)))
     if not rows:
         return []
-    told = (
+    note = (
         f"The last point of the curves, on {views} test views, and the same avatars over all test views, as in the "
         "table: mean over scenes of the mean over seeds. By so much the curves, the times and the areas are off."
     )
     head = ("method", *(i.display.head(i.region) for i in columns))
     title = "Where the curves end, and what the table has"
-    return [Heading(3, title), Table(head, tuple(rows)), Paragraph(told)]
+    return [Heading(3, title), Table(head, tuple(rows)), Paragraph(note)]
 
 
 def _end_cell(configuration: Configuration, identity: Identity, scenes: Sequence[str]) -> str:
@@ -356,12 +354,12 @@ def _area_table(
     ]
     head = [i.display.head(i.region) for i, _, _ in columns]
     windows = sorted({f"{_seconds(start)} to {_seconds(end)}" for _, start, end in columns})
-    told = (
+    note = (
         f"Mean of the metric over the logarithm of fitting time, from {'; '.join(windows)}: from the latest first "
         "checkpoint of any run to the end of the longest fit; a finished fit keeps its last value. Mean over scenes."
     )
     title = f"Area under the quality-time curve, on {views} test views"
-    return [Heading(3, title), Table(("method", *head), tuple(rows)), Paragraph(told)]
+    return [Heading(3, title), Table(("method", *head), tuple(rows)), Paragraph(note)]
 
 
 def _area_cell(

@@ -62,7 +62,7 @@ def interval_text(interval: Interval, text: Callable[[float], str]) -> str:
 def score_cells(runs: Sequence[RunResult], identities: Sequence[Identity], row: str) -> list[str]:
     """A row of these runs as a table shows it: of each identity the mean over seeds of a scene, then over scenes."""
     means = [(i, scene_means(runs, i, row)) for i in identities]
-    return [i.display.text(macro_mean(found).value) if found else "—" for i, found in means]
+    return [i.display.text(macro_mean(mean).value) if mean else "—" for i, mean in means]
 
 
 def further_rows(runs: Sequence[RunResult]) -> list[str]:
@@ -72,16 +72,16 @@ def further_rows(runs: Sequence[RunResult]) -> list[str]:
 
 def _comparisons(values: Mapping[str, Mapping[str, float]], metric: Metric) -> list[str]:
     """The best row against every other over the scenes that both have, p values adjusted for their number."""
-    having = {label: found for label, found in values.items() if len(found) >= 2}
+    having = {label: pair for label, pair in values.items() if len(pair) >= 2}
     if len(having) < 2:
         return []
     sign = 1 if metric.higher_is_better else -1
     best = max(having, key=lambda label: sign * math.fsum(having[label].values()) / len(having[label]))
     tests = {}
-    for label, found in having.items():
-        common = sorted(set(having[best]) & set(found))
+    for label, pair in having.items():
+        common = sorted(set(having[best]) & set(pair))
         if label != best and len(common) >= 2:
-            a, b = ({scene: rows[scene] for scene in common} for rows in (having[best], found))
+            a, b = ({scene: rows[scene] for scene in common} for rows in (having[best], pair))
             tests[label] = paired_test(a, b), [a[scene] - b[scene] for scene in common]
     if not tests:
         return []

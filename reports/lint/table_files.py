@@ -30,8 +30,8 @@ def read_tables(path: Path) -> Reading:
     text = read_text(path, "a file of tables", LARGEST_FILE)
     grids, notes = reader(text)
     if not grids:
-        told = f" ({notes[0][1]}, line {notes[0][0]})" if notes else ""
-        raise BadInput(f"{path}: no table in it{told}; expected a tabular environment or a Markdown table")
+        note = f" ({notes[0][1]}, line {notes[0][0]})" if notes else ""
+        raise BadInput(f"{path}: no table in it{note}; expected a tabular environment or a Markdown table")
     return Reading([table for grid in grids for table in tables_of(grid)], notes)
 
 

@@ -130,8 +130,8 @@ def _named(table: Table, names: Mapping[str, str], footnotes: Footnotes) -> Tabl
 
 
 def _quoted(table: PaperTable, footnotes: Footnotes, as_printed: bool, choice: Choice) -> Table:
-    wanted = choice.ordered({row.name: row.name for row in table.rows})
-    table = replace(table, rows=tuple(next(row for row in table.rows if row.name == name) for name in wanted))
+    names = choice.ordered({row.name: row.name for row in table.rows})
+    table = replace(table, rows=tuple(next(row for row in table.rows if row.name == name) for name in names))
     marks: list[list[str]]
     if as_printed:
         marks = [[row.printed if cell.status != "absent" else "" for cell in row.cells] for row in table.rows]
@@ -229,8 +229,8 @@ def _measured_block(
 ) -> Table:
     everything = list({id(run): run for _, runs in filled for run in runs}.values())
     labelled = by_label(_configured(everything))
-    wanted = choice.ordered({label: having[0].method for label, having in labelled.items()})
-    labelled = {label: labelled[label] for label in wanted}
+    order = choice.ordered({label: having[0].method for label, having in labelled.items()})
+    labelled = {label: labelled[label] for label in order}
     kind: Kind = "stand-in" if standin else "real data"
     notes: list[str] = []
     if standin:
@@ -295,14 +295,14 @@ def _measured_block(
 
 def _identity(done: Sequence[RunResult], group: Group, metric: str, region: str) -> Identity | None:
     """The first definition of a metric in a region that these runs have; one with numbers before one without."""
-    found = [
+    identities = [
         identity
         for run in done
         for identity in run.rows.get(group_row(run.method, group.views), {})
         if identity.metric == metric and identity.region == region
     ]
-    present = [i for i in found if any(not m.absent for m in _means(done, i, group.views))]
-    return next(iter(present or found), None)
+    present = [i for i in identities if any(not m.absent for m in _means(done, i, group.views))]
+    return next(iter(present or identities), None)
 
 
 def _means(runs: Sequence[RunResult], identity: Identity, views: str) -> list[Mean]:

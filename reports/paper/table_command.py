@@ -103,12 +103,12 @@ def _results(chosen: TableOptions, protocols: list[str]) -> tuple[list[RunResult
         if chosen.runs != TableOptions.runs:
             raise BadInput(f"--runs {chosen.runs}: no such folder; give a folder of runs or leave it out")
         return [], []
-    wanted = {name: getattr(chosen, name) for name in ("method", "profile")}
-    wanted = {name: value for name, value in wanted.items() if value is not None}
+    filters = {name: getattr(chosen, name) for name in ("method", "profile")}
+    filters = {name: value for name, value in filters.items() if value is not None}
     results: list[RunResult] = []
     left_out: list[str] = []
     for protocol in dict.fromkeys(protocols):
-        having, without = Index(chosen.runs).results(protocol=protocol, **wanted)
+        having, without = Index(chosen.runs).results(protocol=protocol, **filters)
         results += having
         left_out += without
     left_out = list(dict.fromkeys(left_out))

@@ -132,5 +132,5 @@ def _in_one_line(box: str) -> str:
 
 def _of_several(found: re.Match[str]) -> str:
     """What is wrong with one of several values: tyro itself says only that something is."""
-    wanted = KINDS.get(found[3], "numbers in digits 0 to 9, such as 12")
-    return f"{found[1].strip('[]')}: expected {wanted}; {found[2]}"
+    expected = KINDS.get(found[3], "numbers in digits 0 to 9, such as 12")
+    return f"{found[1].strip('[]')}: expected {expected}; {found[2]}"

@@ -71,8 +71,8 @@ def with_frames(asked: list[CropView], frames: list[CropView]) -> list[CropView]
     person = [
         frames[v.index].person if v.index < len(frames) else none for v, none in zip(asked, nobody, strict=True)
     ]
-    wanted = {view.index for view in asked}
-    others = [replace(f, unknown=np.zeros_like(f.unknown)) for f in frames if f.index not in wanted]
+    indices = {view.index for view in asked}
+    others = [replace(f, unknown=np.zeros_like(f.unknown)) for f in frames if f.index not in indices]
     return [replace(view, person=filmed) for view, filmed in zip(asked, person, strict=True)] + others
 
 

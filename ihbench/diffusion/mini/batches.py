@@ -100,12 +100,12 @@ class Batches(Dataset[MiniBatch]):
         images, person, labels = self.crops.images(width, rows)
         hidden = np.stack([random_mask(rng, silhouette) for silhouette in person])
         use_parts = bool(rng.random() < config.control)
-        prompts, told = self.words(rng, rows[:, 2])
+        prompts, captioned = self.words(rng, rows[:, 2])
         return MiniBatch(
             *(torch.from_numpy(array) for array in (images, person, hidden, labels)),
             timesteps=torch.from_numpy(rng.integers(0, self.timesteps, len(rows))),
             traits=torch.from_numpy(self.crops.traits[rows[:, 2]]),
-            told=torch.tensor(told),
+            told=torch.tensor(captioned),
             ids=padded_ids(self.tokenizer, prompts, self.max_tokens),
             noise_seed=int(rng.integers(2**62)),
             use_parts=use_parts,
@@ -114,10 +114,10 @@ class Batches(Dataset[MiniBatch]):
     def words(self, rng: np.random.Generator, people: NDArray[np.int64]) -> tuple[list[str], list[bool]]:
         """A prompt for each, and whether trait tokens speak in it."""
         config = self.config
-        prompts, told = [], []
+        prompts, captioned = [], []
         for person in people:
             chance = rng.random()
-            told.append(bool(chance < config.traits))
+            captioned.append(bool(chance < config.traits))
             kept = [phrase for phrase in self.crops.phrases[person] if rng.random() < config.phrase_kept]
             if chance < config.traits:
                 prompts.append(" ".join(["a photo of", *["person"] * TRAIT_TOKENS]))
@@ -126,7 +126,7 @@ class Batches(Dataset[MiniBatch]):
                 prompts.append(f"{PERSON} with {' , '.join(kept[k] for k in order)}")
             else:
                 prompts.append(PERSON)
-        return prompts, told
+        return prompts, captioned
 
     def stream(self, first: int, last: int, workers: int, pinned: bool = False) -> Iterator[MiniBatch]:
         """Batches of steps `first` to `last` - 1, made by workers ahead of their time; `pinned` for a GPU."""

@@ -32,8 +32,8 @@ def check_mini(folder: Path) -> tuple[Path, dict[str, Config]]:
             raise BadInput(f"{folder / part}: expected {stem}.safetensors, found {why}")
     for part, expected in CLASSES.items():
         if configs[part].get("_class_name") != expected:
-            found = configs[part].get("_class_name")
-            raise BadInput(f"{folder / part}: {found}, expected {expected}: not a mini backbone; {HOW}")
+            kind = configs[part].get("_class_name")
+            raise BadInput(f"{folder / part}: {kind}, expected {expected}: not a mini backbone; {HOW}")
     _check_channels(folder, configs)
     return folder, configs
 

@@ -106,8 +106,8 @@ def _cases() -> list[Case]:
 
 def _scores(preset: Preset, case: Case, background: tuple[float, float, float]) -> dict[str, float]:
     asked = [name for name in case.regions if "+" not in name]
-    found = evaluate(case.pred, case.truth, case.regions, preset, background, over=asked)
-    return {identity: score.value for identity, score in found.items()}
+    scores = evaluate(case.pred, case.truth, case.regions, preset, background, over=asked)
+    return {identity: score.value for identity, score in scores.items()}
 
 
 def _against_oracles(presets: Sequence[Preset], networks: dict[str, lpips.Network]) -> Iterator[Comparison]:

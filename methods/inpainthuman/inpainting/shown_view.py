@@ -30,8 +30,8 @@ def with_known_surface(view: TrainView, training: TrainingSet, avatar: Renderer,
     body = training.body
     hidden = view.mask == MaskState.UNKNOWN
     needed = surface.map_of(surface.needed)
-    wanted = hidden & pixels_of(needed, body.pose(view.body_pose), body, view.camera)
-    known = hidden & ~wanted
+    unseen = hidden & pixels_of(needed, body.pose(view.body_pose), body, view.camera)
+    known = hidden & ~unseen
     rgb, alpha = avatar.render(view.camera, view.body_pose, training.background)
     image, mask = view.image.copy(), view.mask.copy()
     image[known] = np.rint(rgb[known] * 255).astype(np.uint8)

@@ -91,14 +91,14 @@ def key_views(faced: Sequence[NDArray[np.int64]], needed: NDArray[np.bool_], mos
     useful = [k for k, texels in enumerate(own) if len(texels)]
     if most == 0 or len(useful) <= most:
         return useful
-    wanted = np.where(needed, float(ENOUGH), 0.0)
+    missing = np.where(needed, float(ENOUGH), 0.0)
     chosen: list[int] = []
     while len(chosen) < most:
         # a texel still wanted counts fully, one painted often enough a little: all frames left are of some use
-        gains = [-1.0 if k in chosen else (np.minimum(wanted[own[k]], 1) + 0.01).sum() for k in useful]
+        gains = [-1.0 if k in chosen else (np.minimum(missing[own[k]], 1) + 0.01).sum() for k in useful]
         best = useful[int(np.argmax(gains))]
         chosen.append(best)
-        wanted[own[best]] = np.maximum(wanted[own[best]] - 1, 0)
-        if not wanted.any():
+        missing[own[best]] = np.maximum(missing[own[best]] - 1, 0)
+        if not missing.any():
             break
     return sorted(chosen)

@@ -70,22 +70,22 @@ def _inpaint(
     progress: Progress,
 ) -> list[NDArray[np.uint8]]:
     texels = texel_table(body, resolution)
-    seen, wanted, pixels = [], [], []
+    seen, targets, pixels = [], [], []
     with progress.task("reading the texture", len(views)) as task:
         for view in views:
             seen.append(_seen(view, body, texels))
             number = pixel_texels(view, body, texels)
             pixels.append(view.unknown & (number >= 0))
-            wanted.append(number[pixels[-1]])
+            targets.append(number[pixels[-1]])
             task.advance()
     if mirrored:
         other = mirrored_texels(body, resolution)
-        wanted = [other[texel] for texel in wanted]
-    borrowed = nearest_colours(wanted, seen, np.array([view.index for view in views], np.int64), len(texels.index))
+        targets = [other[texel] for texel in targets]
+    borrowed = nearest_colours(targets, seen, np.array([view.index for view in views], np.int64), len(texels.index))
     means = _part_means(views)
     out = []
-    for view, hidden, (colour, found) in zip(views, pixels, borrowed, strict=True):
-        fill = np.where(found[:, None], colour, means[smpl_parts(view.parts)[hidden]])
+    for view, hidden, (colour, nearest) in zip(views, pixels, borrowed, strict=True):
+        fill = np.where(nearest[:, None], colour, means[smpl_parts(view.parts)[hidden]])
         out.append(view.completed(on_background(hidden, fill, background)))
     return out
 

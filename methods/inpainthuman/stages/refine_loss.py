@@ -75,12 +75,12 @@ def refine_loss(
     if config.background > 0:
         loss = loss + config.background * (error * target.cleared).sum() / (3 * total)
     if config.ssim > 0 or distance is not None:
-        seen, wanted = where_known(rgb, target.image, target.unknown)
+        seen, target_seen = where_known(rgb, target.image, target.unknown)
         if config.ssim > 0:
-            loss = loss + config.ssim * dissimilarity(seen, wanted, target.weight)
+            loss = loss + config.ssim * dissimilarity(seen, target_seen, target.weight)
         if distance is not None:
             inside = target.weight > 0
-            pair = (torch.where(inside, image, target.off) for image in (seen, wanted))
+            pair = (torch.where(inside, image, target.off) for image in (seen, target_seen))
             loss = loss + config.lpips * distance(*pair)
     return loss
 

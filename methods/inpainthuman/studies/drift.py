@@ -191,11 +191,11 @@ def _deviation(sightings: Sequence[Sighting], size: int) -> tuple[int, float]:
 
 def _change(sightings: Sequence[Sighting]) -> float:
     """Mean absolute difference between sightings that follow each other, NaN for none."""
-    found = [np.zeros((0, 3))]
+    changes = [np.zeros((0, 3))]
     for (a, x), (b, y) in pairwise(sightings):
         _, i, j = np.intersect1d(a, b, assume_unique=True, return_indices=True)
-        found.append(np.abs(x[i] - y[j]))
-    return _mean(np.concatenate(found))
+        changes.append(np.abs(x[i] - y[j]))
+    return _mean(np.concatenate(changes))
 
 
 def _mean(values: NDArray) -> float:
