@@ -30,15 +30,16 @@ COLUMNS = (
 
 
 def frame(runs: Path | str | Iterable[Path | str]) -> pandas.DataFrame:
-    """The finished runs of a folder of runs, or these run folders, view by view: a line for each method, scene, seed,
-    protocol, profile, row, camera, frame and metric.
+    """The finished runs of a folder of runs, or one run folder or several, view by view: a line for each method,
+    scene, seed, protocol, profile, row, camera, frame and metric.
 
     `identity` is the metric's with its region, `value` is in the metric's own unit (dB for PSNR), NaN where it is
     absent, and `absent` then says why; `digest` names the run. What cannot be read is left out: its lines stand in
     `.attrs["left_out"]`. Raises `BadInput` where there is no such folder, or none of those named can be read.
     """
     if isinstance(runs, str | os.PathLike):
-        return frame_of(*Index(user_path(runs)).results())
+        folder = user_path(runs)
+        return frame_of(*(read_results([folder]) if (folder / "run.json").is_file() else Index(folder).results()))
     try:
         folders = [user_path(folder) for folder in runs]
     except TypeError as error:

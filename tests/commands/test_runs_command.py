@@ -140,6 +140,7 @@ def test_every_number_of_every_view_becomes_one_table(ihbench, runs, monkeypatch
     assert set(psnr.absent) == {""}
     assert set(table[table.value.isna()].absent) == {"weights are not there"}
     assert frame(psnr.folder[:2]).equals(table[table.folder.isin(psnr.folder[:2])].reset_index(drop=True))
+    assert set(frame(psnr.folder.iloc[0]).folder) == {psnr.folder.iloc[0]}
     file = runs / "scores.csv"
     ihbench("runs", "export", "--out", str(file))
     back = pandas.read_csv(
