@@ -126,8 +126,10 @@ def profile_of(chosen: AblateOptions) -> Any:
 
 
 def _suites(method: str) -> dict[str, AblationSuite]:
+    from ihbench.runner.ablation import AblationSuite
+
     spec = method_spec(method)
-    return spec.load(spec.ablations) if spec.ablations else {}
+    return spec.load(spec.ablations, Mapping, AblationSuite) if spec.ablations else {}
 
 
 def _suite(chosen: AblateOptions, vary: Mapping[str, Sequence[Any]], switches: Mapping[str, Any]) -> AblationSuite:

@@ -7,7 +7,7 @@ as "package.module:NAME" and imported when it is used.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -69,12 +69,17 @@ class MethodSpec:
 
     def profile(self, name: str) -> Config:
         """The configuration of a profile. Raises `BadInput` for an unknown one."""
-        profiles: Mapping[str, Config] = self.load(self.profiles)
+        profiles = self.load(self.profiles, Mapping)
         if name not in profiles:
             raise BadInput(
                 f"method {self.name!r}: unknown profile {name!r}: {registry.nearest(name, list(profiles))}"
             )
-        return profiles[name]
+        config = profiles[name]
+        if isinstance(config, type) or not is_dataclass(config):
+            raise BadInput(
+                f"method {self.name!r}: profile {name!r} is {config!r:.60}, expected a dataclass's instance"
+            )
+        return config
 
     def create(self, config: Config) -> Method:
         return self.load(self.method)(config)
@@ -87,16 +92,33 @@ class MethodSpec:
         """Files and folders beside the package whose content moves numbers."""
         return () if self.outside_files is None else self.load(self.outside_files)(config)
 
-    def load(self, part: Any) -> Any:
-        """What `ablations`, `stress`, a kernel or a command's `main` names; an object as it is. Raises `BadInput`."""
-        if not isinstance(part, str):
-            return part
-        module, _, attribute = part.partition(":")
-        try:
-            return getattr(import_module(module), attribute)
-        except (Exception, SystemExit) as error:
-            reason = " ".join(f"{error if isinstance(error, ImportError) else repr(error)}".split())
-            raise BadInput(f"method {self.name!r}: {part} cannot be loaded: {reason}") from error
+    def load(self, part: Any, kind: Any = Callable, of: type = object) -> Any:
+        """What `ablations`, `stress`, a kernel or a command's `main` names; an object as it is. Raises `BadInput`,
+        for one of another kind or with something in it that is none `of` these, too."""
+        loaded = part
+        if isinstance(part, str):
+            module, _, attribute = part.partition(":")
+            try:
+                loaded = getattr(import_module(module), attribute)
+            except (Exception, SystemExit) as error:
+                reason = " ".join(f"{error if isinstance(error, ImportError) else repr(error)}".split())
+                raise BadInput(f"method {self.name!r}: {part} cannot be loaded: {reason}") from error
+        if not isinstance(loaded, kind):
+            raise BadInput(
+                f"method {self.name!r}: {part!r:.60} is {loaded!r:.60}, expected a {kind.__name__.lower()}"
+            )
+        for item in () if of is object else loaded.values() if isinstance(loaded, Mapping) else loaded:
+            if not isinstance(item, of):
+                raise BadInput(f"method {self.name!r}: {part!r:.60} has {item!r:.60} in it, expected {of.__name__}s")
+        return loaded
+
+
+KINDS = {  # field of a spec -> what it must be: a package that got it wrong must not take `ihbench --help` along
+    **dict.fromkeys(("title", "summary", "licence", "implemented"), str),
+    "profiles": (str, Mapping), "paper": (Paper, type(None)), "needs": (tuple, list),
+    "shared_states": Mapping, "ablations": (str, Mapping), "stress": (str, list, tuple),
+    "kernels": Mapping, "commands": Mapping,
+}  # fmt: skip
 
 
 def method_spec(name: str) -> MethodSpec:
@@ -108,9 +130,15 @@ def method_spec(name: str) -> MethodSpec:
         raise BadInput(f"{where} is {spec!r:.60}, expected an ihbench.scene.method_spec.MethodSpec({known})")
     if spec.name != name:
         raise BadInput(f"{where} calls itself {spec.name!r}; its entry point and its spec must have one name")
+    for what, kind in KINDS.items():
+        if not isinstance(value := getattr(spec, what), kind):
+            raise BadInput(f"{where} has the {what} {value!r:.60}; see ihbench.scene.method_spec for what it must be")
+    for command, brought in spec.commands.items():
+        if not isinstance(brought, Command):
+            raise BadInput(f"{where}: command {command!r} is {brought!r:.60}, expected a Command(summary, main)")
     package = registry.entry_point("method", name).module.partition(".")[0]
     for part in (spec.method, spec.profiles):  # a run records the code of the package that registers the method
-        if isinstance(part, str) and part.partition(".")[0] not in (package, "ihbench"):
+        if isinstance(part, str) and part.partition(":")[0].partition(".")[0] not in (package, "ihbench"):
             raise BadInput(f"{where} names {part}, expected something of its own package {package!r} or of ihbench")
     return spec
 

@@ -21,7 +21,7 @@ def all_cases() -> list[Case]:
     """Every case, group by group: the bench's own, then those of registered methods."""
     cases = [case for group in GROUPS for case in import_module(f"ihbench.stress.{group}").CASES]
     for spec in usable_specs():
-        cases += spec.load(spec.stress) if spec.stress else []
+        cases += spec.load(spec.stress, Sequence, Case) if spec.stress else []
     return sorted(cases, key=lambda case: GROUPS.index(case.group) if case.group in GROUPS else len(GROUPS))
 
 

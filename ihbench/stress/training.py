@@ -1,6 +1,6 @@
 """Stiff training: what is asked of any method, and how a case states what became of a fit.
 
-A method brings its own cases: a module with a list CASES, registered under `ihbench.stress`. This one has the cases
+A method brings its own cases: a list of them, named in its `MethodSpec.stress`. This one has the cases
 that need none, of the pieces that every fit here is made of.
 """
 

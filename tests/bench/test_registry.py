@@ -101,9 +101,16 @@ def test_a_clash_at_the_end_is_found_before_anything_is_fitted(install, bench, m
     assert not bench.runs.exists()
 
 
+THEIRS = """from ihbench.scene.method_spec import MethodSpec
+SPEC = MethodSpec(name="theirs", title="T", summary="s", method="{}", profiles={{}}, commands={})"""
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
+        (THEIRS.format("zzz_theirs:Method", {"mine": 3}), "command 'mine' is 3, expected a Command(summary, main)"),
+        (THEIRS.format("zzz_theirs:Method", []), "has the commands []"),
+        (THEIRS.format("another:Method", {}), "names another:Method, expected something of its own package"),
         ("SPEC = object", "is <class 'object'>, expected an ihbench.scene.method_spec.MethodSpec(name, title, "),
         ("from ihbench.methods.inpainthuman.spec import SPEC", "calls itself 'inpainthuman'"),
         ("raise OSError('no')", "cannot be loaded (package zzz-theirs): OSError('no')"),

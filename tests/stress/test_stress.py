@@ -51,7 +51,7 @@ def test_the_set_is_large_named_versioned_and_reasoned(cases):
 
 
 def test_a_method_brings_its_own_cases(cases):
-    own = [case for spec in usable_specs() for case in spec.load(spec.stress)]
+    own = [case for spec in usable_specs() for case in spec.load(spec.stress, list)]
     assert {case.name for case in own} <= set(cases)
     assert {f"inpainthuman-rate-{factor}" for factor in (0.1, 1, 10, 100)} <= {case.name for case in own}
 

@@ -1,6 +1,6 @@
 """Stiff training of InpaintHuman: the smallest avatar, a person of six small frames, and everything that goes wrong.
 
-Registered under `ihbench.stress`. A case's note says which steps the guard rejected and where it went back to.
+Named in the spec. A case's note says which steps the guard rejected and where it went back to.
 """
 
 from __future__ import annotations
