@@ -26,6 +26,7 @@ from ihbench.config_fields import (
     flat,
     hints,
     read,
+    refuse_repeated,
     replaced,
     whole,
 )
@@ -310,6 +311,11 @@ class ProtocolFile:
                 f"metrics.headline is {self.metrics.headline!r}, which has no number where the occluder stands in "
                 "test images; expected another region, for example body"
             )
+        refuse_repeated(self.subjects.names, "subjects.names")
+        refuse_repeated(self.subjects.standin, "subjects.standin")
+        refuse_repeated(self.metrics.presets, "metrics.presets")
+        refuse_repeated(self.metrics.regions, "metrics.regions")
+        refuse_repeated([group.name for group in self.also or ()], "also")
 
 
 WORDS = ("title", "reason", "source")  # for readers: no choices

@@ -113,6 +113,8 @@ def test_further_test_views_are_a_flag():
         ("--protocol.subjects.names ../x", "--protocol.subjects.names, entry 1: expected a name"),
         ("--protocol.image.background 0 0", "input length 2 did not match"),
         ("--protocol.metrics.regions full", "headline is 'body', expected one of full"),
+        ("--protocol.metrics.regions body body", "'body' stands there twice"),
+        ("--protocol.also a,0:3,0:9 a,0:3,9:12", "'a' stands there twice"),
     ],
 )
 def test_a_choice_that_no_protocol_has_is_refused_by_its_flag(words, told):

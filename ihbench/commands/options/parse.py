@@ -127,6 +127,7 @@ def _in_one_line(box: str) -> str:
     words = "".join("\n" if RULE.fullmatch(line) else f"{line} " for line in box.splitlines()[1:])
     parts = [" ".join(BORDER.sub("", part).split()).rstrip(".") for part in words.splitlines()]
     line = "; ".join(part for part in parts if part and not part.startswith("For full helptext"))
+    line = re.sub(r"\[/?bold\]", "", line)  # tyro leaves its own markup in some
     return TUPLE.sub(_of_several, UNION.sub("", line))
 
 
