@@ -106,7 +106,7 @@ def test_no_such_data_folder(refused, tmp_path):
 def test_a_data_folder_without_the_layout(refused, tmp_path):
     (tmp_path / "empty").mkdir()
     line = refused(*refused.bench.run_words("--data", tmp_path / "empty"))
-    assert f"{tmp_path / 'empty'}: no layout of zju_mocap (no CoreView_* folder in it" in line
+    assert f"{tmp_path / 'empty'}: no layout of zju_mocap (no subject of this layout in it" in line
 
 
 @pytest.mark.parametrize("camera", ["Camera_B1", "Camera_B17"])

@@ -215,4 +215,4 @@ def test_scoring_is_timed_on_a_stand_in(bench, monkeypatch):
         rows = scoring.score_rows(1, views=3, profile="quick")
     assert [r.backend for r in rows] == ["psnr+ssim", "psnr+ssim+flip"]
     assert all(r.forward_ms > 0 for r in rows)
-    assert rows[0]["case"].startswith("3 views@")
+    assert rows[0].case.startswith("3 views@")

@@ -13,10 +13,10 @@ def test_as_many_steps_as_the_reference_differ_by_rounding_alone_and_fewer_by_mo
     backbone = tiny_backbone()
     before = weights(backbone.unet)
     rows = sampler_rows(1, steps=(1, 3, 6), many=6, given=backbone)
-    assert [r["backend"] for r in rows] == ["1 steps", "3 steps", "6 steps"] * 2
-    assert len({r["case"] for r in rows}) == 2
+    assert [r.backend for r in rows] == ["1 steps", "3 steps", "6 steps"] * 2
+    assert len({r.case for r in rows}) == 2
     for k in (0, 3):
-        one, three, six = (r["value_error"] for r in rows[k : k + 3])
+        one, three, six = (r.value_error for r in rows[k : k + 3])
         assert six < 1e-4 < three
         assert six < 1e-4 < one
     assert backbone.dtype == torch.float32

@@ -25,6 +25,12 @@ def record(bench):
     return read_json(folder / "run.json")
 
 
+def ended(bench):
+    """Status and reason."""
+    outcome = record(bench)["outcome"]
+    return outcome["status"], outcome["reason"]
+
+
 def events(bench, kind):
     return [event["data"] for event in record(bench)["ledger"]["events"] if event["kind"] == kind]
 
@@ -44,7 +50,7 @@ sys.exit(main(sys.argv[1:]))
     words = [sys.executable, "-c", code, *bench.run_words()]
     done = subprocess.run(words, env=bench.environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == -signal.SIGKILL, done.stderr
-    assert record(bench)["status"] == "running"
+    assert ended(bench)[0] == "running"
 
 
 def assert_continues_to_the_same_numbers(bench, finished, step):
@@ -52,7 +58,7 @@ def assert_continues_to_the_same_numbers(bench, finished, step):
     assert outcome.status == 0
     assert f"continuing stage1 at step {step}" in outcome.err
     (folder,) = bench.folders()
-    assert record(bench)["status"] == "done"
+    assert ended(bench)[0] == "done"
     assert [event["step"] for event in events(bench, "resumed")] == [step]
     assert by_view(folder) == by_view(finished.folder)
     assert contents(folder)["avatar/avatar.safetensors"] == contents(finished.folder)["avatar/avatar.safetensors"]
@@ -121,14 +127,13 @@ def test_an_interrupted_run_says_so_and_continues(bench, finished, monkeypatch):
         outcome = bench.run()
     assert (outcome.status, outcome.out) == (130, "")
     assert outcome.err.splitlines()[-1] == "ihbench: interrupted; the same command continues where it stopped"
-    assert (record(bench)["status"], record(bench)["reason"]) == ("interrupted", "interrupted by the user")
+    assert ended(bench) == ("interrupted", "interrupted by the user")
     assert "Not done: inpainthuman on standin-1: interrupted" in bench("report", "--runs", bench.runs).out
     assert_continues_to_the_same_numbers(bench, finished, SAVED)
-    stages = {row["stage"]: row for row in record(bench)["ledger"]["table"]}
+    stages = record(bench)["ledger"]["stages"]
     assert stages["redone"]["seconds"] > 0
-    assert sum(row["seconds"] for row in stages.values() if row["depth"] == 0) == pytest.approx(
-        2 * stages["total"]["seconds"]
-    )
+    top = sum(stage["seconds"] for path, stage in stages.items() if "/" not in path)
+    assert 0 < top <= record(bench)["ledger"]["seconds"] * (1 + 1e-9)
 
 
 def test_a_damaged_checkpoint_costs_time_and_nothing_else(bench, finished, monkeypatch):
@@ -150,8 +155,9 @@ def test_a_damaged_checkpoint_costs_time_and_nothing_else(bench, finished, monke
 
 def assert_diverged(bench, outcome, step):
     assert outcome.status == 1
-    assert (record(bench)["status"], [event["step"] for event in events(bench, "diverged")]) == ("diverged", [step])
-    reason = record(bench)["reason"]
+    assert [event["step"] for event in events(bench, "diverged")] == [step]
+    status, reason = ended(bench)
+    assert status == "diverged"
     assert reason.startswith(f"diverged at step {step}: ")
     assert f"Not done: inpainthuman on standin-1: diverged ({reason})." in outcome.out
     assert "| inpainthuman" not in outcome.out
@@ -190,11 +196,11 @@ def test_a_method_that_raises_fails_with_its_reason_and_the_other_runs_go_on(ben
     outcome = bench.run("--seed", 0, 1, method=broken_mannequin)
     assert outcome.status == 1
     failed, done = bench.folders()
-    why = read_json(failed / "run.json")
+    why = read_json(failed / "run.json")["outcome"]
     assert (why["status"], why["reason"]) == ("failed", "RuntimeError: a leg fell off (see traceback.txt)")
     assert "in fit\n" in (failed / "traceback.txt").read_text()
     assert f"Not done: mannequin on standin-1: failed ({why['reason']})." in outcome.out
-    assert read_json(done / "run.json")["status"] == "done"
+    assert read_json(done / "run.json")["outcome"]["status"] == "done"
     assert "Traceback" not in outcome.err
     assert f"(see {failed / 'traceback.txt'})" in outcome.out.splitlines()[-2]
 
@@ -203,8 +209,8 @@ def test_a_failed_run_is_tried_again(bench, mannequin, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr("own_method.method.Mannequin.fit", lambda *_, **__: 1 / 0)
         assert bench.run(method=mannequin).status == 1
-    assert record(bench)["reason"].startswith("ZeroDivisionError: division by zero")
+    assert ended(bench)[1].startswith("ZeroDivisionError: division by zero")
     assert bench.run(method=mannequin).status == 0
-    assert (record(bench)["status"], record(bench)["reason"]) == ("done", "")
+    assert ended(bench) == ("done", "")
     (folder,) = bench.folders()
     assert not (folder / "traceback.txt").exists()
