@@ -9,16 +9,17 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Annotated, Any, TypedDict
 
 from ihbench.clock import interruption, machine
 from ihbench.clock.checkpoints import States, Tensors, Words, state_file
 from ihbench.clock.events import Event, Happening, Warned
 from ihbench.files.atomic import encode, write_bytes
+from ihbench.files.shape import WHOLE, Matches, Within
 
 if TYPE_CHECKING:
     from ihbench.clock.progress import Progress
@@ -31,6 +32,11 @@ SAVE_SHARE = 0.05  # of the time may go into saving states
 STAGE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.+-]*(/[A-Za-z0-9][A-Za-z0-9 _.+-]*)*")
 ARTIFACTS = {"inpainting.png": "painted training views"}  # files that methods leave beside the record -> their titles
 
+Seconds = Annotated[float, Within(0)]
+Megabytes = Annotated[float, Within(0, nan=True)]  # NaN where the system does not tell
+StagePath = Annotated[
+    str, Matches(re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.+-]{0,99}(/[A-Za-z0-9][A-Za-z0-9 _.+-]{0,99}){0,9}"), "a stage")
+]  # fmt: skip
 OnCheckpoint = Callable[[int, float, Any], None]
 
 
@@ -38,11 +44,11 @@ OnCheckpoint = Callable[[int, float, Any], None]
 class Stage:
     """What one stage has cost so far."""
 
-    seconds: float = 0.0  # wall
+    seconds: Seconds = 0.0  # wall
     cpu_seconds: float = 0.0  # all threads of the process
-    peak_mb: float = 0.0  # the process's peak when the stage last ended
-    peak_device_mb: float = 0.0
-    entered: int = 0
+    peak_mb: Megabytes = 0.0  # the process's peak when the stage last ended
+    peak_device_mb: Megabytes | None = 0.0
+    entered: Annotated[int, Within(0, WHOLE)] = 0
 
 
 class StageRow(TypedDict):
@@ -54,17 +60,18 @@ class StageRow(TypedDict):
     seconds: float
     cpu_seconds: float
     peak_mb: float
-    peak_device_mb: float
+    peak_device_mb: float | None
     entered: int
 
 
-class Books(TypedDict):
-    """What `Ledger.state` gives and `Ledger(state=...)` takes: JSON-able."""
+@dataclass(frozen=True)
+class LedgerState:
+    """The books of a run, as its record keeps them and `Ledger(state=...)` takes them."""
 
-    stages: Mapping[str, Mapping[str, float]]
-    seconds: float
+    stages: Mapping[StagePath, Stage]
+    seconds: Seconds
     cpu_seconds: float
-    events: Sequence[Mapping[str, Any]]
+    events: tuple[Event, ...]
 
 
 @dataclass(frozen=True)
@@ -98,7 +105,7 @@ class Ledger:
         folder: Path | None = None,
         *,
         device: str = "cpu",
-        state: Books | None = None,
+        state: LedgerState | None = None,
         on_checkpoint: OnCheckpoint | None = None,
         on_event: Callable[[Event], None] | None = None,  # of each, as it happens
         quality_times: QualityTimes = QualityTimes(),
@@ -120,9 +127,9 @@ class Ledger:
         self._loaded_clock: float | None = None  # the latest fit clock among the states loaded
         self._offered_step: int | None = None
         if state is not None:
-            self._stages = _stages(state["stages"])
-            self._total, self._total_cpu = state["seconds"], state["cpu_seconds"]
-            self.events = [Event.of(row) for row in state["events"]]
+            self._stages = {path: replace(stage) for path, stage in state.stages.items()}
+            self._total, self._total_cpu = state.seconds, state.cpu_seconds
+            self.events = list(state.events)
         self._earlier = len(self.events)  # of these: what happened before this process
         self._last, self._last_cpu = clock(), time.process_time()
         self._last_save, self._save_cost = self._last, 0.0
@@ -332,14 +339,11 @@ class Ledger:
         if self._folder is not None:
             write_bytes(self._folder / name, data)
 
-    def state(self) -> Books:
-        """Everything but the checkpoints, as JSON-able data, for the run record and for `Ledger(state=...)`."""
-        return {
-            "stages": self._clocks(),
-            "seconds": self._total,
-            "cpu_seconds": self._total_cpu,
-            "events": [dict(vars(event)) for event in self.events],
-        }
+    def state(self) -> LedgerState:
+        """Everything but the checkpoints, for the run record and for `Ledger(state=...)`."""
+        self._charge()
+        stages = {path: replace(stage) for path, stage in self._stages.items()}
+        return LedgerState(stages, self._total, self._total_cpu, tuple(self.events))
 
     def table(self) -> list[StageRow]:
         """One row a stage, parents before children, then `other` and `total`.

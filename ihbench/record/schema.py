@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from ihbench.clock.events import Event
+from ihbench.clock.ledger import LedgerState, Megabytes, Seconds
 from ihbench.clock.machine import Machine
 from ihbench.config_fields import Values
 from ihbench.errors import BadInput
@@ -46,14 +47,9 @@ class _Time:
         return "" if aware else f"is {value[:60]!a}, expected a time such as 2025-01-31T12:00:00+00:00"
 
 
-Seconds = Annotated[float, Within(0)]
-Megabytes = Annotated[float, Within(0, nan=True)]  # NaN where the system does not tell
 Count = Annotated[int, Within(0, WHOLE)]
 Moment = Annotated[str, _Time()]
 Words = Annotated[str, Matches(re.compile(r"(?s).{1,1000}"), "a name of 1 to 1000 letters")]
-StagePath = Annotated[
-    str, Matches(re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.+-]{0,99}(/[A-Za-z0-9][A-Za-z0-9 _.+-]{0,99}){0,9}"), "a stage")
-]  # fmt: skip
 Scores = Mapping[Identity, Annotated[float, Within(-1e12, 1e12, nan=True, infinite=True)]]
 Json = Mapping[str, Any]
 
@@ -202,27 +198,6 @@ def value_text(name: str, value: Any) -> str:
     if name == "keep":
         return ",".join(map(str, value))
     return str(tuple(value) if isinstance(value, list) else value)
-
-
-@dataclass(frozen=True)
-class Stage:
-    """What one stage of the ledger has cost."""
-
-    seconds: Seconds
-    cpu_seconds: float = 0.0
-    peak_mb: Megabytes = 0.0
-    peak_device_mb: Megabytes | None = 0.0
-    entered: Count = 1
-
-
-@dataclass(frozen=True)
-class LedgerState:
-    """The books of a run: see `ihbench.clock.ledger`."""
-
-    stages: Mapping[StagePath, Stage]
-    seconds: Seconds
-    cpu_seconds: float
-    events: tuple[Event, ...]
 
 
 @dataclass(frozen=True)

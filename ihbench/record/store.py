@@ -36,7 +36,6 @@ from ihbench.record.schema import (
     SCHEMA_VERSION,
     About,
     CurvePoint,
-    LedgerState,
     Outcome,
     RunIdentity,
     RunRecord,
@@ -186,7 +185,7 @@ class RunFolder:
             raise ValueError(f"run status: expected one of {', '.join(STATUSES)}, got {status!r}")
         self._change(outcome=replace(self.record.outcome, status=status, reason=reason, step=step))
         if ledger is not None:
-            self._change(ledger=from_json(as_json(ledger.state()), LedgerState))
+            self._change(ledger=ledger.state())
         self.save()
 
     def describe(self, **about: Any) -> None:

@@ -18,7 +18,6 @@ from ihbench.clock.ledger import Ledger, OnCheckpoint
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput, Diverged
 from ihbench.files import atomic, removal
-from ihbench.files.shape import as_json
 from ihbench.record.results import TRACEBACK, RunResult, read_result
 from ihbench.record.schema import About, RunIdentity, Status
 from ihbench.record.store import RunFolder, note_interruption
@@ -42,9 +41,8 @@ class RecordedRun(ABC):
     ):
         self.folder, self.progress = folder, progress
         before = folder.record.ledger
-        state = None if before is None else as_json(before)
         self.ledger = Ledger(
-            folder.path, device=device, state=state, on_checkpoint=on_checkpoint, on_event=self._say_where
+            folder.path, device=device, state=before, on_checkpoint=on_checkpoint, on_event=self._say_where
         )
         if before is not None:
             if not any(folder.checkpoints.glob("*.safetensors")):

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from datetime import datetime
 from itertools import chain
 
-from ihbench.clock.ledger import REDONE, in_order
+from ihbench.clock.ledger import REDONE, LedgerState, in_order
 from ihbench.document.document import Block, Heading, Paragraph, Table, Words, bullets, emphasis, strong
 from ihbench.record.results import RunResult
-from ihbench.record.schema import LedgerState, RunRecord
+from ihbench.record.schema import RunRecord
 from ihbench.reports.general.clock import by_machine
 
 TOLERANCE = 0.02  # of the wall clock, that stages may leave unnamed

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ihbench.clock.events import DivergedAt, Inpainted, Reused, Warned
-from ihbench.clock.ledger import Ledger, QualityTimes
+from ihbench.clock.ledger import Ledger, LedgerState, QualityTimes
 
 
 class Clock:
@@ -311,7 +311,7 @@ def test_slow_saves_are_made_rarer(monkeypatch):
     assert seconds_of(ledger)["checkpoint"] == 10
 
 
-def killed_run(folder, until: float = 30.0) -> dict:
+def killed_run(folder, until: float = 30.0) -> LedgerState:
     """A fit that saves at 12 s of its clock and goes on to `until`; gives the ledger's last state."""
     clock = Clock()
     ledger = Ledger(folder, clock=clock, on_checkpoint=lambda *point: clock.sleep(50))
@@ -351,7 +351,7 @@ def test_work_a_kill_threw_away_is_booked_as_redone(tmp_path):
     assert ledger.load_state("stage2") is not None
     assert ledger.fit_seconds == 12
     assert seconds_of(ledger)["redone"] == 18
-    assert ledger.seconds == state["seconds"]
+    assert ledger.seconds == state.seconds
     assert_balanced(ledger)
 
 
@@ -418,7 +418,7 @@ def test_events_carry_both_clocks_and_survive_a_resume():
         clock.sleep(2)
         ledger.event(DivergedAt(9, "loss is NaN"))
     expected = {"kind": "diverged", "fit_seconds": 2, "seconds": 3, "data": {"step": 9, "reason": "loss is NaN"}}
-    assert ledger.state()["events"] == [expected]
+    assert [vars(event) for event in ledger.state().events] == [expected]
     assert Ledger(state=ledger.state()).events == ledger.events
 
 

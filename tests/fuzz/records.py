@@ -296,7 +296,7 @@ def _borrow(runs: Path, good: Path, victim: Path) -> None:
 
 def _go_on(runs: Path, good: Path, victim: Path) -> None:
     run = RunFolder.open(victim)
-    Ledger(state=as_json(run.record.ledger) if run.record.ledger else None).table()
+    Ledger(state=run.record.ledger).table()
     run.curve()
 
 

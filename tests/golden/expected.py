@@ -27,7 +27,7 @@ VARIES = [
     (r"\d+ \w+ +[\d.]+ [kM]B +", "AGE  SIZE  "),
     (r'"bytes": \d+', '"bytes": SIZE'),
     # of a stand-in, the pictures that this or an earlier test has had made
-    (r'(\b(?:image|mask|mask_cihp|new_vertices)"?: )\d+', r"\1NUMBER"),
+    (r'(\b(?:image|mask|mask_cihp|new_vertices|sampled_images)"?: )\d+', r"\1NUMBER"),
     (r"\d+( of \d+ views missing)", r"NUMBER\1"),
     (r'((?:mask_on_body|vertices_in_mask)"?: \d\.\d)\d+', r"\1"),
     (r"\d+\.\d{5,}(?:e-?\d+)?", lambda digits: f"{float(digits[0]):.4g}"),

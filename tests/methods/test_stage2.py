@@ -255,7 +255,7 @@ class TestStage2:
         assert event.data["views"] == 3
         assert event.data["pixels"] > 0
         assert {"identity_drift", "flicker"} <= set(event.data)
-        assert {"look", "inpaint", "silhouette", "measure"} <= set(ledger.state()["stages"])
+        assert {"look", "inpaint", "silhouette", "measure"} <= set(ledger.state().stages)
 
     def test_turntable_views_follow_the_training_views(self):
         config = replace(SIMPLE, turntable=3)

@@ -65,7 +65,7 @@ def fit(config, ledger=None, seed=0):
 def test_off_is_stage_1_exactly(mini):
     ledger = Ledger()
     off = fit(replace(TINY), ledger)
-    assert set(ledger.state()["stages"]) == {"fit", "fit/prepare", "fit/stage1", "checkpoint"}
+    assert set(ledger.state().stages) == {"fit", "fit/prepare", "fit/stage1", "checkpoint"}
     on = fit(config(mini))
     assert not equal_bits(parameters_of(on), parameters_of(off))
     unrefined = fit(replace(config(mini), refine=replace(QUICK.refine, steps=0)))
@@ -75,7 +75,7 @@ def test_off_is_stage_1_exactly(mini):
 def test_all_three_stages_are_in_the_ledger_and_repeat_bit_for_bit(mini):
     ledger = Ledger()
     first = fit(config(mini), ledger)
-    stages = set(ledger.state()["stages"])
+    stages = set(ledger.state().stages)
     inside = ("look", "load", "textual-inversion", "adapt", "inpaint", "silhouette", "measure")
     assert {f"fit/stage2/{name}" for name in inside} | {"fit/stage3"} <= stages
     kinds = [event.kind for event in ledger.events]
@@ -94,7 +94,7 @@ def test_always_personalises_for_a_person_whom_nothing_hides(mini):
     for always in (False, True):
         ledger, method = Ledger(), InpaintHuman(config(mini, always=always))
         avatars.append(method.fit(training_set(views), device="cpu", seed=0, ledger=ledger, progress=QUIET))
-        done = set(ledger.state()["stages"])
+        done = set(ledger.state().stages)
         assert learned & done == (learned if always else set())
         assert "fit/stage2/inpaint" not in done
         assert "fit/stage3" in done
@@ -107,7 +107,7 @@ def test_one_fit_is_stage_1_with_ssim_and_more_steps(mini):
     unfitted = GaussianAvatar(given, the_body(), np.zeros(10), 0)
     assert Stage1(unfitted, hidden_person(), 0, Ledger()).steps == given.fit_steps == 24
     one = fit(given, ledger)
-    assert set(ledger.state()["stages"]) == {"fit", "fit/prepare", "fit/stage1", "checkpoint"}
+    assert set(ledger.state().stages) == {"fit", "fit/prepare", "fit/stage1", "checkpoint"}
     assert outside_files(given) == []
     avatar = GaussianAvatar(replace(given, one_fit=False), the_body(), one.betas, 0)
     avatar.load_state_dict(one.state_dict())

@@ -99,7 +99,7 @@ def test_a_finished_run_is_found_not_made_again(tmp_path):
     again = RunFolder.create(tmp_path, IDENTITY)
     assert again.finished
     assert score_lines(again.path / "scores.jsonl") != []
-    assert Ledger(state=as_json(again.record.ledger)).seconds >= ledger.state()["stages"]["fit"]["seconds"]
+    assert Ledger(state=again.record.ledger).seconds >= ledger.state().stages["fit"].seconds
 
 
 @pytest.mark.parametrize("status", store.STATUSES)

@@ -9,9 +9,10 @@ from dataclasses import replace
 from datetime import datetime, timedelta
 from pathlib import Path
 
+from ihbench.clock.ledger import LedgerState, Stage
 from ihbench.clock.machine import Machine
 from ihbench.record.results import RunResult
-from ihbench.record.schema import About, LedgerState, Outcome, RunIdentity, Stage, curve_points
+from ihbench.record.schema import About, Outcome, RunIdentity, curve_points
 from tests.reports.fake_runs import mean, record
 
 PSNR, FLIP = "psnr/pooled/range1/{}/v1", "flip/ldr-67ppd/srgb/{}/v1"

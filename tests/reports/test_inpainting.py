@@ -6,9 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from ihbench.clock.events import Event
+from ihbench.clock.ledger import LedgerState
 from ihbench.document.markdown import write as markdown
 from ihbench.record.results import RunResult
-from ihbench.record.schema import LedgerState
 from ihbench.reports.general.inpainting import inpainting_section
 from tests.reports.fake_runs import about, identity, record
 

@@ -8,12 +8,10 @@ from dataclasses import replace
 import pytest
 
 from ihbench.clock.events import Event
-from ihbench.clock.ledger import Ledger
+from ihbench.clock.ledger import Ledger, LedgerState, Stage
 from ihbench.document.markdown import write as markdown
 from ihbench.files.atomic import read_json
-from ihbench.files.shape import from_json
 from ihbench.record.results import RunResult, read_result
-from ihbench.record.schema import LedgerState, Stage
 from ihbench.reports.general.ledger_table import TOLERANCE, account, ledger_section
 from tests.reports.made_up_runs import made_up
 
@@ -113,7 +111,7 @@ def test_books_of_a_ledger_with_every_kind_of_interruption_add_up(tmp_path):
             ledger.save_state("s", {}, {})
     now[0] += 0.2
     run = made_up(tmp_path)
-    found = account(with_ledger(run, from_json(ledger.state(), LedgerState)))
+    found = account(with_ledger(run, ledger.state()))
     assert found.wall == pytest.approx(5 + now[0])
     assert found.unnamed == pytest.approx(0.2)
     assert found.adds_up == (TOLERANCE * found.wall >= 0.2)
