@@ -27,28 +27,28 @@ class LintOptions:
 def main(argv: list[str]) -> int:
     """Print one line for each finding; status 1 if there are any. What was not understood goes to stderr."""
     given = options(LintOptions, argv, "report lint", SUMMARY)
+    from ihbench.reports.lint.metric_names import NO_METRIC
     from ihbench.reports.lint.table_files import read_tables
-    from ihbench.reports.lint.table_lint import lint, unknown_heads
+    from ihbench.reports.lint.table_lint import lint
 
     if not given.file:
         raise BadInput("report lint: which file? give one or more .tex or .md files")
     readings = {file: read_tables(file) for file in given.file}  # all of them, before anything is said
-    tables = sum(len(reading.tables) for reading in readings.values())
-    findings = {file: lint(reading.tables) for file, reading in readings.items()}
-    for file, reading in readings.items():
-        first = {text: line for line, text in sorted(reading.notes, reverse=True)}  # said once, where it is met first
-        for head in (head for table in reading.tables for head in unknown_heads(table)):
-            what = f"column {head.title or 'without a head'} has marks, but neither a known metric nor an arrow"
-            first.setdefault(what, head.cell.line)
+    found = [(file, finding) for file, (tables, _) in readings.items() for finding in lint(tables)]
+    for file, (tables, notes) in readings.items():
+        for column in (column for table in tables for column in table.columns):
+            if column.metric == NO_METRIC and any(cell.mark for cell in column.cells):
+                what = f"column {column.title or 'without a head'} has marks, but neither a known metric nor an arrow"
+                notes.append((column.line, what))
+        first = {text: line for line, text in sorted(notes, reverse=True)}  # said once, where it is met first
         for text, line in sorted(first.items(), key=lambda note: note[::-1]):
             print(f"ihbench: {file}:{line}: note: {text}", file=sys.stderr)
+    count = sum(len(tables) for tables, _ in readings.values())
     if given.json:
-        rows = [{"file": str(file), **asdict(finding)} for file, of_file in findings.items() for finding in of_file]
-        print(json.dumps({"status": "found" if rows else "clean", "tables": tables, "findings": rows}))
+        rows = [{"file": str(file), **asdict(finding)} for file, finding in found]
+        print(json.dumps({"status": "found" if rows else "clean", "tables": count, "findings": rows}))
+    elif found:
+        print("\n".join(f"{file}:{finding}" for file, finding in found))
     else:
-        for file, of_file in findings.items():
-            for finding in of_file:
-                print(f"{file}:{finding}")
-        if not any(findings.values()):
-            print(f"nothing found in {tables} table{'' if tables == 1 else 's'}")
-    return 1 if any(findings.values()) else 0
+        print(f"nothing found in {count} table{'' if count == 1 else 's'}")
+    return 1 if found else 0

@@ -35,10 +35,10 @@ STAR = re.compile(r"\s*[*∗⋆]")
 class HeadMetric:
     """What the head of a column says of its metric."""
 
-    name: str  # "lpips"; as written where nobody knows it
-    arrow: str  # "↑", "↓" or ""
-    scaled: bool  # a star, × 1000 or % stands beside the name
-    unit: str  # "dB"
+    name: str = ""  # "lpips"; as written where nobody knows it
+    arrow: str = ""  # "↑", "↓" or ""
+    scaled: bool = False  # a star, × 1000 or % stands beside the name
+    unit: str = ""  # "db"
 
     @property
     def cost(self) -> bool:
@@ -53,6 +53,9 @@ class HeadMetric:
     @property
     def higher_is_better(self) -> bool:
         return self.arrow == UP if self.usual is None else self.usual
+
+
+NO_METRIC = HeadMetric()
 
 
 def head_metric(text: str) -> HeadMetric | None:

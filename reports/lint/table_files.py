@@ -10,16 +10,16 @@ from markdown_it.token import Token
 
 from ihbench.errors import BadInput
 from ihbench.files.regular import read_text
-from ihbench.reports.lint.latex_reading import latex_grids, show
-from ihbench.reports.lint.table_reading import PAIRED, Grid, GridRow, ReadCell, Reading, Styled, read_cell, tables_of
+from ihbench.reports.lint.latex_reading import Notes, latex_grids, show
+from ihbench.reports.lint.table_reading import PAIRED, Cell, Grid, Styled, Table, read_cell, tables_of
 
-BOLD, UNDERLINED = ("strong", "b"), ("u", "ins")
+MARKS = {"u": "second", "ins": "second", "b": "best", "strong": "best"}
 TAG = re.compile(r"<(/?)([A-Za-z]+)")
 LARGEST_FILE = 4 * 2**20  # bytes
 
 
-def read_tables(path: Path) -> Reading:
-    """Every table of a .tex or .md file.
+def read_tables(path: Path) -> tuple[list[Table], Notes]:
+    """Every table of a .tex or .md file, and notes on what was not understood.
 
     Raises `BadInput` for a file that is missing, too large, not text, of another kind, or without any table.
     """
@@ -27,20 +27,18 @@ def read_tables(path: Path) -> Reading:
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise BadInput(f"{path}: expected a .tex or .md file")
-    text = read_text(path, "a file of tables", LARGEST_FILE)
-    grids, notes = reader(text)
+    grids, notes = reader(read_text(path, "a file of tables", LARGEST_FILE))
     if not grids:
         note = f" ({notes[0][1]}, line {notes[0][0]})" if notes else ""
         raise BadInput(f"{path}: no table in it{note}; expected a tabular environment or a Markdown table")
-    return Reading([table for grid in grids for table in tables_of(grid)], notes)
+    return [table for grid in grids for table in tables_of(grid)], notes
 
 
-def markdown_grids(text: str) -> tuple[list[Grid], list[tuple[int, str]]]:
-    """The tables of a Markdown file in order, and notes (line, text) on what was not understood."""
+def markdown_grids(text: str) -> tuple[list[Grid], Notes]:
+    """The tables of a Markdown file in order, and notes on what was not understood."""
     grids: list[Grid] = []
-    notes: list[tuple[int, str]] = []
-    rows: list[GridRow] = []
-    cells: list[ReadCell] = []
+    notes: Notes = []
+    rows: list[list[Cell]] = []
     paired, line = False, 1
     for token in MarkdownIt("commonmark", {"html": True}).enable("table").parse(text):
         line = token.map[0] + 1 if token.map else line
@@ -48,17 +46,13 @@ def markdown_grids(text: str) -> tuple[list[Grid], list[tuple[int, str]]]:
             paired |= re.search(rf"<!--\s*{PAIRED}\s*-->", token.content) is not None
             if "<table" in token.content.lower():
                 notes.append((line, "tables in HTML are not read"))
-        elif token.type == "table_open":
-            rows = []
         elif token.type == "tr_open":
-            cells = []
-        elif token.type == "inline":
-            cells.append(read_cell(_styled(token.children or []), line))
-        elif token.type == "tr_close":
-            rows.append(GridRow(tuple(cells), line))
+            rows.append([])
+        elif token.type == "inline" and rows:
+            rows[-1].append(read_cell(_styled(token.children or []), line))
         elif token.type == "table_close":
-            grids.append(Grid(rows[0].line, tuple(rows), paired, heads=1))
-            paired = False
+            grids.append(Grid(rows[0][0].line, rows, [False] * len(rows), paired, heads=1))
+            rows, paired = [], False
     return grids, notes
 
 
@@ -69,18 +63,15 @@ def _styled(tokens: list[Token]) -> Styled:
     for token in tokens:
         tag = TAG.match(token.content) if token.type == "html_inline" else None
         name = tag[2].lower() if tag else token.tag
-        if (tag and not tag[1] and name != "br") or token.nesting > 0:
-            opened.append(name)
-        elif (tag and tag[1]) or token.nesting < 0:
-            if name in opened:
-                opened.remove(name)
-        elif token.type in ("softbreak", "hardbreak") or name == "br":
+        nesting = (-1 if tag[1] else 1) if tag else token.nesting
+        if token.type in ("softbreak", "hardbreak") or name == "br":
             styled.append((" ", ""))
+        elif nesting > 0:
+            opened.append(name)
+        elif nesting < 0:
+            opened = [o for o in opened if o != name]
         elif "sup" not in opened:
-            mark = (
-                "best" if any(o in BOLD for o in opened) else "second" if any(o in UNDERLINED for o in opened) else ""
-            )
+            mark = min((MARKS[o] for o in opened if o in MARKS), default="")
             for k, part in enumerate(re.split(r"\$([^$]+)\$", token.content)):
-                styled += [(c, own or mark) for c, own in (show(part)[0] if k % 2 else [(c, "") for c in part])]
-    text = "".join(character for character, _ in styled)
-    return styled[len(text) - len(text.lstrip()) : len(text.rstrip())]
+                styled += show(part, {}, [], mark) if k % 2 else [(c, mark) for c in part]
+    return styled

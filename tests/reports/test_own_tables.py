@@ -30,10 +30,10 @@ TABLE1, TABLE2 = paper_table("table1"), paper_table("table2")
 def linted(text, kind, tmp_path):
     file = tmp_path / f"own.{kind}"
     file.write_text(text, encoding="utf-8")
-    reading = read_tables(file)
-    assert reading.tables
-    assert not reading.notes
-    return lint(reading.tables)
+    tables, notes = read_tables(file)
+    assert tables
+    assert not notes
+    return lint(tables)
 
 
 def fragment(frame, kind):

@@ -59,9 +59,9 @@ def read_back(text, suffix, tmp_path):
     file.write_text(text, encoding="utf-8")
     width = 3  # PSNR, SSIM, LPIPS* of a data set
     return [
-        [[(c.number.shown if c.number else "—", c.mark) for c in row.cells[-(len(row.cells) // width * width) :]]
-         for row in table.rows]
-        for table in read_tables(file).tables
+        [[(c.shown or "—", c.mark) for c in row[-(len(row) // width * width) :]]
+         for row in zip(*(column.cells for column in table.columns), strict=True)]
+        for table in read_tables(file)[0]
     ]  # fmt: skip
 
 

@@ -57,7 +57,7 @@ def text_of(rows, kind, head=HEAD, before=""):
 def findings(text, kind, tmp_path):
     file = tmp_path / f"table.{kind}"
     file.write_text(text, encoding="utf-8")
-    return lint(read_tables(file).tables)
+    return lint(read_tables(file)[0])
 
 
 def lines_of(rows, tmp_path, head=HEAD, before=""):
