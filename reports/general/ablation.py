@@ -6,6 +6,7 @@ Seeds are averaged within a scene; the scene is the unit of intervals and tests.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -89,11 +90,15 @@ def _table(suite: AblationSuite, protocol: str, cells: Found) -> tuple[list[Bloc
         }
     blocks.append(Table(("rung", "scenes", "runs", *titles), tuple(lines)))
     timed = grouped((variant, run) for variant, having in runs.items() for run in having if run.timed)
-    blocks += bullets([*_left_out(runs), *clock_notes(timed)])
+    notes: list[Words] = []
+    for variant, having in runs.items():
+        omissions = [f"{what} in {n} of {len(having)} runs" for what, n in _omissions(having).items()]
+        notes += [f"left out by the plan, {variant}: {'; '.join(omissions)}"] if omissions else []
+    blocks += bullets([*notes, *clock_notes(timed)])
     more, compared = _comparisons(suite.comparisons, runs, columns)
     if quoted:
-        quoted_from = "The paper's numbers are quoted: its own data, whole images, LPIPS* = 1000 × LPIPS."
-        blocks.append(Paragraph(quoted_from))
+        quotes = "The paper's numbers are quoted: its own data, whole images, LPIPS* = 1000 × LPIPS."
+        blocks.append(Paragraph(quotes))
     if more:
         blocks += [Paragraph("What each component is worth (paired over scenes, mean over seeds):"), *more]
     return blocks, {"protocol": protocol, "headline": headline, "rungs": variants, "comparisons": compared}
@@ -101,30 +106,16 @@ def _table(suite: AblationSuite, protocol: str, cells: Found) -> tuple[list[Bloc
 
 def _omissions(runs: Sequence[RunResult]) -> dict[str, int]:
     """What the plan left out -> in how many of the runs."""
-    texts = [f"{field} → {_plain_text(value)}" for run in runs for field, value in run.planned.items()]
-    return {text: texts.count(text) for text in dict.fromkeys(texts)}
-
-
-def _left_out(runs: Mapping[str, Sequence[RunResult]]) -> list[str]:
-    """A line for each variant that the plan has changed."""
-    lines = []
-    for variant, having in runs.items():
-        omissions = [f"{what} in {n} of {len(having)} runs" for what, n in _omissions(having).items()]
-        if omissions:
-            lines.append(f"left out by the plan, {variant}: {'; '.join(omissions)}")
-    return lines
+    planned = [(field, value) for run in runs for field, value in run.planned.items()]
+    texts = [f"{name} → {'+'.join(map(str, v)) if isinstance(v, list | tuple) else v}" for name, v in planned]
+    return dict(Counter(texts))
 
 
 def _columns(runs: Sequence[RunResult], headline: str) -> list[Identity]:
     """PSNR of the headline region and of what training showed of the surface, then the other metrics' headline."""
     having = list(dict.fromkeys(i for run in runs for i, mean in run.own.items() if not mean.absent))
-    identities = [i for i in having if i.region == headline]
-    first = [i for i in identities if i.metric == "psnr"]
-    surface = [
-        i for region in REGIONS for i in having
-        if i.metric == "psnr" and i.region == region and i not in first
-    ]  # fmt: skip
-    return [*first, *surface, *(i for i in identities if i not in first)]
+    psnr = [i for region in (headline, *REGIONS) for i in having if (i.metric, i.region) == ("psnr", region)]
+    return list(dict.fromkeys([*psnr, *(i for i in having if i.region == headline)]))
 
 
 def _comparisons(
@@ -153,8 +144,8 @@ def _comparisons(
     lines: list[tuple[Words, ...]] = []
     for row in rows:
         n = max(pair["n"] for pair in row["scores"].values() if pair)
-        cells = [_difference(row["scores"][str(i)], i.display) for i in columns]
-        cells.append(_seconds_text(row["fit_seconds"]))
+        cells = [_difference(row["scores"][str(i)], i.display.scale, i.display.decimals) for i in columns]
+        cells.append(_difference(row["fit_seconds"]))
         lines.append((row["what"], str(n), *cells))
     if impossible:
         said = f"[{LEVEL:.0%} interval]; * better or worse with p < {ALPHA} (sign-flip test, Holm over the rows)."
@@ -175,7 +166,7 @@ def _of_both(a: Sequence[RunResult], b: Sequence[RunResult]) -> tuple[list[RunRe
     return first, second
 
 
-def _paired(a: Mapping[str, float], b: Mapping[str, float]) -> dict[str, float | int | str | None] | None:
+def _paired(a: Mapping[str, float], b: Mapping[str, float]) -> dict[str, Any] | None:
     """The first minus the second over the scenes of both; None without any. One scene has neither interval nor p."""
     common = sorted(set(a) & set(b))
     if not common:
@@ -189,34 +180,23 @@ def _paired(a: Mapping[str, float], b: Mapping[str, float]) -> dict[str, float |
     }  # fmt: skip
 
 
-def _difference(pair: dict[str, Any] | None, metric: Metric) -> str:
+def _difference(pair: dict[str, Any] | None, scale: float = 1.0, decimals: int = 0) -> str:
+    """The difference, its interval, and of seconds the share."""
     if pair is None:
         return "—"
-    d = metric.decimals
-    if pair["n"] == 1:
-        return f"{pair['mean'] * metric.scale:+z.{d}f}"
-    mean, low, high = (pair[name] * metric.scale for name in ("mean", "low", "high"))
-    mark = "*" if pair["p_adjusted"] < ALPHA else ""
-    return f"{mean:+z.{d}f}{mark} [{low:+z.{d}f}, {high:+z.{d}f}]"
+    shown = [pair[name] for name in ("mean", "low", "high") if pair[name] is not None]
+    mean, *ends = (f"{value * scale:+z.{decimals}f}" for value in shown)
+    mark = "*" if pair.get("p_adjusted", 1.0) < ALPHA else ""
+    share = "" if pair.get("share") is None else f", {pair['share']:+z.0%}"
+    return mean + mark + (f" [{', '.join(ends)}]" if ends else "") + share
 
 
 def _more_seconds(after: Sequence[RunResult], before: Sequence[RunResult]) -> dict[str, Any] | None:
     """As `_paired`, with the share that the difference is of the seconds before; None where these are 0."""
     without = _seconds(before)
-    pair: dict[str, Any] | None = _paired(_seconds(after), without)
-    if pair is None:
-        return None
-    mean = math.fsum(without.values()) / len(without)
-    return pair | {"share": pair["mean"] / mean if mean > 0 else None}
-
-
-def _seconds_text(pair: dict[str, Any] | None) -> str:
-    """Seconds more (or fewer), their interval, and the share."""
-    if pair is None:
-        return "—"
-    interval = "" if pair["n"] == 1 else f" [{pair['low']:+z.0f}, {pair['high']:+z.0f}]"
-    share = "" if pair["share"] is None else f", {pair['share']:+z.0%}"
-    return f"{pair['mean']:+z.0f}{interval}{share}"
+    pair = _paired(_seconds(after), without)
+    mean = math.fsum(without.values()) / max(len(without), 1)
+    return None if pair is None else pair | {"share": pair["mean"] / mean if mean > 0 else None}
 
 
 def _severities(suite: AblationSuite, tables: Sequence[Mapping[str, Any]]) -> list[Block]:
@@ -248,9 +228,8 @@ def _numbers(interval: Interval | None) -> dict[str, float | None] | None:
     """For JSON, which knows no NaN."""
     if interval is None:
         return None
-    ends = {name: value if math.isfinite(value) else None for name, value in
-            (("low", interval.low), ("high", interval.high))}  # fmt: skip
-    return {"mean": interval.value, **ends, "n": interval.n}
+    low, high = (end if math.isfinite(end) else None for end in (interval.low, interval.high))
+    return {"mean": interval.value, "low": low, "high": high, "n": interval.n}
 
 
 def _shown(interval: Interval | None, metric: Metric) -> str:
@@ -261,7 +240,3 @@ def _shown(interval: Interval | None, metric: Metric) -> str:
         half = (interval.high - interval.low) / 2 * metric.scale
         text += f" ± {half:.{metric.decimals}f}"
     return text
-
-
-def _plain_text(value: Any) -> str:
-    return "+".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
