@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import cycle
 from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
@@ -16,7 +17,7 @@ from ihbench.metrics import Identity
 from ihbench.metrics.identity import METRICS
 from ihbench.metrics.statistics import Interval, interval_ends
 from ihbench.record import outputs
-from ihbench.record.quality_time import QualityCurve, error_of, pareto_set
+from ihbench.record.quality_time import QualityCurve, error_of
 from ihbench.record.results import RunResult, by_group, grouped
 from ihbench.record.schema import plain_name
 from ihbench.reports.general.configurations import Configuration, configurations, short_value, sweeps
@@ -27,6 +28,7 @@ from ihbench.reports.general.run_time import (
     comparable,
     curve_identities,
     curves,
+    pareto,
     same_protocol,
     seconds_interval,
     standing,
@@ -58,28 +60,24 @@ def draw(results: Sequence[RunResult], folder: Path) -> list[tuple[Path, str]]:
     names: set[str] = set()
     for (protocol, digest, profile, data), runs in groups.items():
         name = _new(f"{plain_name(protocol)}_{plain_name(profile)}", digest, names)
-        configs = configurations(runs)
-        headline = runs[0].headline
+        configs, headline = configurations(runs), runs[0].headline
         title = f"{protocol}, {profile} profile"
         drawn += _work_precision(configs, headline, folder / f"work-precision_{name}", title, data)
         drawn += _quality_time(configs, headline, folder / f"quality-time_{name}", title, data)
     for (protocol, data), runs in same_protocol(results).items():
         name = _new(f"{plain_name(protocol)}_profiles-and-sizes", "", names)
-        headline = runs[0].headline
         about = f"{data}; test images differ in size: compare errors with care"
-        configs = configurations(runs, across=True)
-        title = f"{protocol}: profiles and image sizes"
-        drawn += _work_precision(configs, headline, folder / f"work-precision_{name}", title, about)
+        configs, title = configurations(runs, across=True), f"{protocol}: profiles and image sizes"
+        drawn += _work_precision(configs, runs[0].headline, folder / f"work-precision_{name}", title, about)
     return drawn
 
 
 def _new(name: str, digest: str, taken: set[str]) -> str:
     """A file name that no other group has."""
-    for candidate in (name, f"{name}_{digest[:6]}", *(f"{name}_{k}" for k in range(2, 1000))):
-        if candidate not in taken:
-            taken.add(candidate)
-            return candidate
-    raise AssertionError(name)
+    candidates = (name, f"{name}_{digest[:6]}", *(f"{name}_{k}" for k in range(2, 1000)))
+    new = next(candidate for candidate in candidates if candidate not in taken)
+    taken.add(new)
+    return new
 
 
 # ---------------------------------------------------------------------------------------------------- work-precision
@@ -91,10 +89,8 @@ def _work_precision(
     configs, scenes = comparable(configs)
     panels: dict[Identity, list[WorkPoint]] = {}
     for i in dict.fromkeys(i for c in configs for run in c.runs for i in run.own):
-        if i.region != headline or i.metric not in METRICS or len(panels) == DRAWN:
-            continue
-        points = [p for p in work_points(configs, i, scenes) if p.seconds.value > 0 and p.error.value > 0]
-        if points:
+        points = [p for p in work_points(configs, i) if p.seconds.value > 0 and p.error.value > 0]
+        if i.region == headline and i.metric in METRICS and points and len(panels) < DRAWN:
             panels[i] = points
     if not panels:
         return []
@@ -103,7 +99,7 @@ def _work_precision(
     handles: dict[str, Artist] = {}
     labels: list[tuple[Axes, list[diagram.Label], list[list[tuple[float, float]]]]] = []
     for panel, (identity, points) in zip(axes, panels.items(), strict=True):
-        front = pareto_set([p.seconds.value for p in points], [p.error.value for p in points])
+        front = pareto(points)
         diagram.logarithmic(panel, _shown([p.seconds for p in points]), _shown([p.error for p in points]))
         labels.append((panel, *_points(panel, points, handles)))
         steps = [_at(points[k]) for k in front]
@@ -113,7 +109,7 @@ def _work_precision(
             )
             handles.setdefault("Pareto set: nothing is as fast and better", line)
         _name_axes(panel, identity, f"seconds of fitting, mean of {len(scenes)} scene{'s' * (len(scenes) > 1)}")
-        rows += [_csv_row(p, identity, k in front, scenes) for k, p in enumerate(points)]
+        rows += [_csv_row(p, identity, k in front, len(scenes)) for k, p in enumerate(points)]
     _finish(drawn, handles, f"Work-precision: {title}", about)
     for panel, beside, lines in labels:
         diagram.place_labels(panel, beside, lines)
@@ -133,10 +129,9 @@ def _points(
     labels: dict[int, diagram.Label] = {}
     lines: list[list[tuple[float, float]]] = []
     swept: set[int] = set()
-    style = iter(range(1000))
+    style = zip(cycle(diagram.COLOURS), cycle(diagram.MARKS), strict=False)
     for sweep in sweeps([p.configuration for p in points]):
-        k = next(style)
-        colour, mark = diagram.COLOURS[k % len(diagram.COLOURS)], diagram.MARKS[k % len(diagram.MARKS)]
+        colour, mark = next(style)
         members = [(value, place[id(c)]) for value, c in sweep.members]
         lines.append([_at(p) for _, p in members])
         (line,) = panel.plot(*zip(*lines[-1], strict=True), color=colour, marker=mark, ms=6, lw=1.6, zorder=3)
@@ -148,16 +143,12 @@ def _points(
             if sweep.axis in p.configuration.changed:
                 labels[id(p)] = diagram.Label(_at(p), short_value(value), colour)
     for p in points:
-        c = p.configuration
-        if id(c) in swept and c.changed:
+        c, plain = p.configuration, id(p.configuration) in swept
+        if plain and c.changed:
             continue
-        k = next(style)
-        plain = id(c) in swept
-        colour = "#000000" if plain else diagram.COLOURS[k % len(diagram.COLOURS)]
-        mark = "*" if plain else diagram.MARKS[k % len(diagram.MARKS)]
-        (point,) = panel.plot(
-            [p.seconds.value], [p.error.value], color=colour, marker=mark, ms=13 if plain else 7, ls="", zorder=4
-        )
+        colour, mark = next(style)
+        colour, mark, size = ("#000000", "*", 13) if plain else (colour, mark, 7)
+        (point,) = panel.plot(*_at(p), color=colour, marker=mark, ms=size, ls="", zorder=4)
         _bars(panel, p, colour)
         handles.setdefault(f"{c.label}{f': {PROFILE_POINT}' if plain else ''}", point)
         labels.setdefault(id(p), diagram.Label(_at(p), ""))
@@ -169,11 +160,13 @@ def _at(p: WorkPoint) -> tuple[float, float]:
 
 
 def _bars(panel: Axes, p: WorkPoint, colour: str) -> None:
-    for interval, along_x in ((p.seconds, True), (p.error, False)):
+    x, y = _at(p)
+    for interval, ends in (
+        (p.seconds, ((p.seconds.low, p.seconds.high), (y, y))),
+        (p.error, ((x, x), (p.error.low, p.error.high))),
+    ):
         if math.isfinite(interval.low) and interval.low > 0:
-            ends = [interval.low, interval.high]
-            middle = [p.error.value] * 2 if along_x else [p.seconds.value] * 2
-            panel.plot(*((ends, middle) if along_x else (middle, ends)), color=colour, lw=1, alpha=0.3, zorder=2)
+            panel.plot(*ends, color=colour, lw=1, alpha=0.3, zorder=2)
 
 
 def _shown(intervals: Sequence[Interval]) -> list[float]:
@@ -187,28 +180,25 @@ def _shown(intervals: Sequence[Interval]) -> list[float]:
     return [*values, *(min(max(end, low), high) for end in ends)]
 
 
-def _csv_row(p: WorkPoint, identity: Identity, on_front: bool, scenes: Sequence[str]) -> dict[str, object]:
+def _csv_row(p: WorkPoint, identity: Identity, on_front: bool, scenes: int) -> dict[str, object]:
     c = p.configuration
-    runs = [run for run in c.runs if run.scene in scenes]
     return {
         "configuration": c.label,
         "method": c.method,
         "switches": ", ".join(f"{name}={value}" for name, value in c.changed.items()),
-        "scenes": len(scenes),
-        "runs": len(runs),
-        "fit_seconds": p.seconds.value,
-        "fit_seconds_low": p.seconds.low,
-        "fit_seconds_high": p.seconds.high,
-        "total_seconds": seconds_interval(runs, "total_seconds").value,
+        "scenes": scenes,
+        "runs": len(c.runs),
+        **_ends("fit_seconds", p.seconds),
+        "total_seconds": seconds_interval(c.runs, "total_seconds").value,
         "identity": str(identity),
-        "value": p.value.value,
-        "value_low": p.value.low,
-        "value_high": p.value.high,
-        "error": p.error.value,
-        "error_low": p.error.low,
-        "error_high": p.error.high,
+        **_ends("value", p.value),
+        **_ends("error", p.error),
         "pareto": on_front,
     }
+
+
+def _ends(name: str, interval: Interval) -> dict[str, float]:
+    return {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
 
 
 # ------------------------------------------------------------------------------------------------------ quality-time
@@ -268,14 +258,13 @@ def _curve_panel(
         ]  # fmt: skip
         if not points:
             continue
-        mean = _mean_curve(lines_of)
-        errors = [error_of(metric, value) for _, value, _, _ in mean]
+        times, *bands = _mean_curve(lines_of)
+        means, low, high = ([error_of(metric, value) for value in band] for band in bands)
         dash = diagram.DASHES[k // len(diagram.COLOURS) % len(diagram.DASHES)]
-        (line,) = panel.plot([t for t, *_ in mean], errors, color=colour, lw=1.8, ls=dash, zorder=3)
+        (line,) = panel.plot(times, means, color=colour, lw=1.8, ls=dash, zorder=3)
         handles.setdefault(c.label, line)
         if len(configs) <= CROWD:
-            low, high = ([error_of(metric, row[side]) for row in mean] for side in (2, 3))
-            panel.fill_between([t for t, *_ in mean], low, high, color=colour, alpha=0.15, lw=0, zorder=1)
+            panel.fill_between(times, low, high, color=colour, alpha=0.15, lw=0, zorder=1)
             panel.plot(
                 [p["seconds"] for p in points], [p["error"] for p in points],
                 ls="", marker=mark, ms=3.5, color=colour, alpha=0.35, mew=0, zorder=2,
@@ -285,13 +274,13 @@ def _curve_panel(
             {"kind": "mean", "configuration": c.label, "identity": str(identity), "seconds": t, "value": value,
              "test_views": standing(c.runs), "error": error_of(metric, value), "value_low": low_end,
              "value_high": high_end}
-            for t, value, low_end, high_end in mean
+            for t, value, low_end, high_end in zip(times, *bands, strict=True)
         ]  # fmt: skip
     return rows
 
 
-def _mean_curve(found: dict[tuple[str, int], QualityCurve]) -> list[tuple[float, float, float, float]]:
-    """(seconds, value, low, high) of the mean over scenes of the mean over seeds, where every run has a value."""
+def _mean_curve(found: dict[tuple[str, int], QualityCurve]) -> list[list[float]]:
+    """Seconds, values, lows, highs of the mean over scenes of the mean over seeds, where every run has a value."""
     start = max(float(c.seconds[0]) for c in found.values())
     end = max(float(c.seconds[-1]) for c in found.values())
     times = np.geomspace(start, end, GRID) if start < end else np.array([start])
@@ -301,9 +290,7 @@ def _mean_curve(found: dict[tuple[str, int], QualityCurve]) -> list[tuple[float,
     known = np.isfinite(means).all(-1)
     times, means = times[known], means[known]
     low, high = interval_ends(means, LEVEL) if len(by_scene) > 1 else np.full((2, len(times)), np.nan)
-    return [
-        (float(t), float(v), float(a), float(b)) for t, v, a, b in zip(times, means.mean(-1), low, high, strict=True)
-    ]
+    return [part.tolist() for part in (times, means.mean(-1), low, high)]
 
 
 # ------------------------------------------------------------------------------------------------------------- shared

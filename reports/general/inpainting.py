@@ -17,7 +17,7 @@ def inpainting_section(labelled: Mapping[str, Sequence[RunResult]]) -> list[Bloc
     rows: list[tuple[Words, ...]] = []
     for label, runs in labelled.items():
         painted = [[event.data for event in run.record.events if event.kind == Inpainted.kind] for run in runs]
-        last = [events[-1] for events in painted if events]  # of several, if a run was resumed
+        last = [dict(events[-1]) for events in painted if events]  # of several, if a run was resumed
         if not last:
             continue
         numbers = pd.json_normalize(last).apply(pd.to_numeric, errors="coerce")

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
 
@@ -47,41 +47,40 @@ class WorkPoint:
     error: Interval  # the same as an error, see `error_of`
 
 
-# ----------------------------------------------------------------------------------------------------------- numbers
-
-
 def comparable(configs: Sequence[Configuration]) -> tuple[list[Configuration], list[str]]:
-    """Configurations that can be compared, and the scenes that all of these were run on.
+    """Configurations that can be compared, with their runs on the scenes that all of them were run on; these scenes.
 
     Where no scene is common to all, or few are, those rows stand back that lack what most others have: chosen are the
     scenes of one row, or what two have in common, with the most rows times scenes. Of very many different sets of
     scenes those are looked at that most rows have.
     """
-    own = [frozenset(run.scene for run in c.runs) for c in configs]
-    rows = Counter(own)
+    rows = Counter(frozenset(run.scene for run in c.runs) for c in configs)
     several = [scenes for scenes, _ in rows.most_common(MOST_SETS)] if len(rows) > MOST_SETS else list(rows)
     best, most = frozenset(), (0, 0)
     for scenes in dict.fromkeys(a & b for a in several for b in several if a & b):
         members = sum(count for having, count in rows.items() if scenes <= having)
         if (members * len(scenes), members) > most:
             best, most = scenes, (members * len(scenes), members)
-    return [c for c, having in zip(configs, own, strict=True) if best and best <= having], sorted(best)
+    alike = [replace(c, runs=tuple(run for run in c.runs if run.scene in best)) for c in configs]
+    return [c for c in alike if best and best == {run.scene for run in c.runs}], sorted(best)
 
 
-def work_points(configs: Sequence[Configuration], identity: Identity, scenes: Sequence[str]) -> list[WorkPoint]:
-    """Seconds and error of every configuration over these scenes; those without a finite number are left out."""
+def work_points(configs: Sequence[Configuration], identity: Identity) -> list[WorkPoint]:
+    """Seconds and error of every configuration; those without a finite number are left out."""
     work_points = []
     for c in configs:
-        runs = [run for run in c.runs if run.scene in scenes]
-        values = per_scene(runs, identity)
-        if not values:
-            continue
-        value = mean_interval(values, LEVEL)
-        metric = identity.metric
-        ends = sorted(error_of(metric, end) for end in (value.low, value.high))
-        error = Interval(error_of(metric, value.value), ends[0], ends[1], value.level, value.n, value.method)
-        work_points.append(WorkPoint(c, seconds_interval(runs), value, error))
+        if values := per_scene(c.runs, identity):
+            value = mean_interval(values, LEVEL)
+            error, *ends = (error_of(identity.metric, v) for v in (value.value, value.low, value.high))
+            interval = replace(value, value=error, low=min(ends), high=max(ends))
+            work_points.append(WorkPoint(c, seconds_interval(c.runs), value, interval))
     return work_points
+
+
+def pareto(points: Iterable[WorkPoint]) -> list[int]:
+    """See `pareto_set`."""
+    costs = [(p.seconds.value, p.error.value) for p in points]
+    return pareto_set([seconds for seconds, _ in costs], [error for _, error in costs])
 
 
 def seconds_interval(runs: Sequence[RunResult], key: str = "fit_seconds") -> Interval:
@@ -102,12 +101,6 @@ def curve_identities(configs: Sequence[Configuration]) -> list[Identity]:
     return list(dict.fromkeys(i for c in configs for run in c.runs for p in run.curve for i in p.scores))
 
 
-def times_to(target: float, found: Mapping[tuple[str, int], QualityCurve], scenes: Sequence[str]) -> dict[str, float]:
-    """Scene -> seconds to the quality, the median over its seeds: `NEVER` where half or more never get there."""
-    by_scene = grouped((s, time_to_quality(curve, target)) for (s, _), curve in found.items() if s in scenes)
-    return {scene: median(times) for scene, times in by_scene.items()}
-
-
 def standing(runs: Iterable[RunResult]) -> str:
     """On how many of how many test views the curves of these runs stand: "6 of 55", "all 4"."""
     rows: set[tuple[int, int]] = set()
@@ -119,13 +112,10 @@ def standing(runs: Iterable[RunResult]) -> str:
     return " or ".join(texts)
 
 
-def in_table(configuration: Configuration, identity: Identity, scenes: Sequence[str]) -> dict[str, float]:
+def in_table(configuration: Configuration, identity: Identity, scenes: Container[str]) -> dict[str, float]:
     """Scene -> what the table has of these runs, over all test views: the mean over seeds, NaN where absent."""
     means = ((run.scene, run.own.get(identity)) for run in configuration.runs if run.scene in scenes)
     return seed_means((scene, math.nan if mean is None else mean.value) for scene, mean in means)
-
-
-# ---------------------------------------------------------------------------------------------------------- sections
 
 
 def run_time_section(
@@ -170,44 +160,39 @@ def same_protocol(results: Sequence[RunResult]) -> dict[tuple[str, str], list[Ru
 
 
 def _cost_table(configs: Sequence[Configuration], identities: Sequence[Identity], headline: str) -> list[Block]:
-    columns = [i for i in identities if i.region == headline]
-    all_rows, (configs, scenes) = configs, comparable(configs)
-    points = {i: {p.configuration.label: p for p in work_points(configs, i, scenes)} for i in columns}
-    columns = [i for i in columns if points[i]]
-    front = {
-        i: pareto_set([p.seconds.value for p in row.values()], [p.error.value for p in row.values()])
-        for i, row in points.items()
+    labels, (configs, scenes) = [c.label for c in configs], comparable(configs)
+    points = {
+        i: {p.configuration.label: p for p in work_points(configs, i)} for i in identities if i.region == headline
     }
-    best = grouped(([*points[i]][k], i.display.title) for i in columns for k in front[i])
+    points = {i: row for i, row in points.items() if row}
+    best = grouped(([*row][k], i.display.title) for i, row in points.items() for k in pareto(row.values()))
     on_gpu = any(_device_mb(run) > 0 for c in configs for run in c.runs)
+    seconds = {c.label: seconds_interval(c.runs) for c in configs}
     rows: list[tuple[Words, ...]] = []
     for c in configs:
-        runs = [run for run in c.runs if run.scene in scenes]
+        labels.remove(c.label)
         cells = [
             c.label,
-            str(len(runs)),
-            interval_text(seconds_interval(runs), "{:.3g}".format),
-            f"{seconds_interval(runs, 'total_seconds').value:.0f}",
-            f"{max(run.about.peak_mb or 0.0 for run in runs):.0f}",
+            str(len(c.runs)),
+            interval_text(seconds[c.label], "{:.3g}".format),
+            f"{seconds_interval(c.runs, 'total_seconds').value:.0f}",
+            f"{max(run.about.peak_mb or 0.0 for run in c.runs):.0f}",
+            *([f"{max(map(_device_mb, c.runs)):.0f}"] if on_gpu else []),
+            *(i.display.text(row[c.label].value.value) if c.label in row else "—" for i, row in points.items()),
+            ", ".join(best.get(c.label, [])) or "—",
         ]
-        cells += [f"{max(_device_mb(run) for run in runs):.0f}"] if on_gpu else []
-        cells += [i.display.text(points[i][c.label].value.value) if c.label in points[i] else "—" for i in columns]
-        cells.append(", ".join(best.get(c.label, [])) or "—")
         rows.append(tuple(cells))
-    metrics = [i.display.head() for i in columns]
-    known = [seconds_interval([run for run in c.runs if run.scene in scenes]) for c in configs]
-    kinds = sorted({interval.method for interval in known if math.isfinite(interval.low)})
+    kinds = sorted({interval.method for interval in seconds.values() if math.isfinite(interval.low)})
     head = ["method", "runs", f"fit s [{SPREAD}]" if kinds else "fit s", "total s", "peak MB"]
-    head += ["GPU MB"] if on_gpu else []
+    head += [*(["GPU MB"] if on_gpu else []), *(i.display.head() for i in points), "Pareto"]
     note = (
         f"Region {headline}, {len(scenes)} scene{'s' if len(scenes) > 1 else ''} that all these rows have. The fit "
         "clock stands still while checkpoints are scored and states are saved; total s is the whole run. Pareto: by "
         "these means no other row is as fast and better in this metric."
     )
-    lacking = [c.label for c in all_rows if c not in configs]
-    note += f" Not here, because they lack some of these scenes: {'; '.join(lacking)}." if lacking else ""
+    note += f" Not here, because they lack some of these scenes: {'; '.join(labels)}." if labels else ""
     note += f" Intervals: {'; '.join(kinds)}." if kinds else ""
-    return [Table((*head, *metrics, "Pareto"), tuple(rows)), Paragraph(note)]
+    return [Table(tuple(head), tuple(rows)), Paragraph(note)]
 
 
 def _quality_times(configs: Sequence[Configuration], headline: str, targets: Sequence[Target]) -> list[Block]:
@@ -216,19 +201,18 @@ def _quality_times(configs: Sequence[Configuration], headline: str, targets: Seq
         return [Paragraph("No run has a quality-time curve (curve.jsonl).")]
     without = [run.folder.name for c in configs for run in c.runs if not run.curve]
     notes: list[Words] = [f"without a readable curve.jsonl: {', '.join(without)}"] if without else []
-    configs, scenes = comparable(configs)
+    configs, _ = comparable(configs)
     views = standing(run for c in configs for run in c.runs)
     return [
-        *_time_table(configs, scenes, views, known, headline, targets),
-        *_area_table(configs, scenes, views, known),
-        *_end_table(configs, scenes, views, [i for i in known if i.region == headline and i.metric in ON_THE_CURVE]),
+        *_time_table(configs, views, known, headline, targets),
+        *_area_table(configs, views, known),
+        *_end_table(configs, views, [i for i in known if i.region == headline and i.metric in ON_THE_CURVE]),
         *bullets(notes),
     ]
 
 
 def _time_table(
     configs: Sequence[Configuration],
-    scenes: Sequence[str],
     views: str,
     known: Sequence[Identity],
     headline: str,
@@ -237,24 +221,23 @@ def _time_table(
     if not targets:
         first = {i.metric: i for i in reversed(known) if i.region == headline}
         targets = [Target(m, v) for m in ON_THE_CURVE if m in first for v in _round_ones(configs, first[m])]
-    columns: list[tuple[Target, Identity]] = []
+    columns: list[tuple[float, Identity]] = []
     missing: list[Words] = []
+    head = ["method"]
     for target in targets:
         region = target.region or headline
-        identities = [i for i in known if (i.metric, i.region) == (target.metric, region)]
-        if identities:
-            columns.append((target, identities[0]))
-        else:
+        i = next((i for i in known if (i.metric, i.region) == (target.metric, region)), None)
+        if i is None:
             missing.append(f"no curve of {target.metric} in {region}: scored at the end of a run only, or not at all")
-    if not columns or not scenes:
-        return bullets(missing)
-    rows = [(c.label, *(_time_cell(c, target.value, i, scenes) for target, i in columns)) for c in configs]
-    head = ["method"]
-    for target, i in columns:
+            continue
+        columns.append((target.value, i))
         metric, sign = i.display, "≥" if i.display.higher_is_better else "≤"
-        where = "" if i.region == headline else f" {i.region}"
+        where = "" if region == headline else f" {region}"
         unit = " dB" if metric.unit == "dB" else ""
         head.append(f"{metric.title}{where} {sign} {target.value * metric.scale:g}{unit}")
+    if not columns or not configs:
+        return bullets(missing)
+    rows = [(c.label, *(_time_cell(c, target, i) for target, i in columns)) for c in configs]
     note = (
         f"Seconds of fitting until the quality was first reached on {views} test views (region "
         f"{headline} where none is named); where the table over all views says otherwise, the cell says so. Median "
@@ -263,12 +246,8 @@ def _time_table(
         "two checkpoints quality is taken as linear in log time. Targets are stated with --target psnr=25; else they "
         "are round numbers that the curves pass."
     )
-    return [
-        Heading(3, f"Time to quality, on {views} test views"),
-        Table(tuple(head), tuple(rows)),
-        Paragraph(note),
-        *bullets(missing),
-    ]
+    title = f"Time to quality, on {views} test views"
+    return [Heading(3, title), Table(tuple(head), tuple(rows)), Paragraph(note), *bullets(missing)]
 
 
 def _round_ones(configs: Sequence[Configuration], identity: Identity) -> list[float]:
@@ -279,23 +258,23 @@ def _round_ones(configs: Sequence[Configuration], identity: Identity) -> list[fl
     return round_targets(kept) or round_targets([curve for *_, curve in every])
 
 
-def _time_cell(configuration: Configuration, target: float, identity: Identity, scenes: Sequence[str]) -> str:
+def _time_cell(configuration: Configuration, target: float, identity: Identity) -> str:
     """Median seconds; with the views that it stands on wherever the table over all views says something else."""
-    seconds, metric = curves(configuration, identity), identity.display
-    times = times_to(target, seconds, scenes)
+    found, metric = curves(configuration, identity), identity.display
+    by_scene = grouped((scene, time_to_quality(curve, target)) for (scene, _), curve in found.items())
+    times = {scene: median(seconds) for scene, seconds in by_scene.items()}  # `NEVER` where half never get there
     if not times:
         return "—"
     views = f"on {standing(run for run in configuration.runs if run.scene in times)} views"
-    table = in_table(configuration, identity, list(times))
+    table = in_table(configuration, identity, times)
     has = {scene: value >= target if metric.higher_is_better else value <= target for scene, value in table.items()}
     says = ""
     if any(math.isfinite(times[scene]) != has[scene] for scene in times):
         of_all = f"it in {sum(has.values())} of {len(has)} scenes" if len(has) > 1 else metric.text(*table.values())
         says = f"; the table has {of_all}"
-    reached = sum(math.isfinite(value) for value in times.values())
+    reached = sum(map(math.isfinite, times.values()))
     if not reached:
-        values = [curve.best for (scene, _), curve in seconds.items() if scene in times]
-        best = max(values) if metric.higher_is_better else min(values)
+        best = (max if metric.higher_is_better else min)(curve.best for curve in found.values())
         return f"never (best {metric.text(best)} {views}{says})"
     interval = median_interval(times, LEVEL)
     shown = _seconds(interval.value)
@@ -305,15 +284,10 @@ def _time_cell(configuration: Configuration, target: float, identity: Identity, 
     return f"{shown} {views}{says}" if says else shown
 
 
-def _end_table(
-    configs: Sequence[Configuration], scenes: Sequence[str], views: str, columns: Sequence[Identity]
-) -> list[Block]:
+def _end_table(configs: Sequence[Configuration], views: str, columns: Sequence[Identity]) -> list[Block]:
     """Where the curves end beside what the table has over all views; nothing where they agree as printed."""
-    rows: list[tuple[Words, ...]] = []
-    for c in configs:
-        cells = [_end_cell(c, i, scenes) for i in columns]
-        if any(cells):
-            rows.append((c.label, *(cell or "as in the table" for cell in cells)))
+    cells = {c.label: [_end_cell(c, i) for i in columns] for c in configs}
+    rows = [(label, *(cell or "as in the table" for cell in row)) for label, row in cells.items() if any(row)]
     if not rows:
         return []
     note = (
@@ -325,49 +299,39 @@ def _end_table(
     return [Heading(3, title), Table(head, tuple(rows)), Paragraph(note)]
 
 
-def _end_cell(configuration: Configuration, identity: Identity, scenes: Sequence[str]) -> str:
+def _end_cell(configuration: Configuration, identity: Identity) -> str:
     """ "20.21, in the table 17.80 (+2.41)"; "" where both are printed alike, or one is absent."""
-    metric = identity.display
-    last = ((scene, float(c.values[-1])) for (scene, _), c in curves(configuration, identity).items())
-    ends = seed_means((scene, value) for scene, value in last if scene in scenes)
-    end = sum(ends.values()) / len(ends) if ends else math.nan
-    table = list(in_table(configuration, identity, list(ends)).values())
-    whole = sum(table) / len(table) if table else math.nan
-    if not (math.isfinite(end) and math.isfinite(whole)) or metric.text(end) == metric.text(whole):
+    text = identity.display.text
+    ends = seed_means((scene, float(c.values[-1])) for (scene, _), c in curves(configuration, identity).items())
+    table = in_table(configuration, identity, ends)
+    end, whole = (sum(found.values()) / len(found) if found else math.nan for found in (ends, table))
+    if not (math.isfinite(end) and math.isfinite(whole)) or text(end) == text(whole):
         return ""
-    sign = "+" if end > whole else "−"
-    return f"{metric.text(end)}, in the table {metric.text(whole)} ({sign}{metric.text(abs(end - whole))})"
+    return f"{text(end)}, in the table {text(whole)} ({'+' if end > whole else '−'}{text(abs(end - whole))})"
 
 
-def _area_table(
-    configs: Sequence[Configuration], scenes: Sequence[str], views: str, known: Sequence[Identity]
-) -> list[Block]:
-    columns: list[tuple[Identity, float, float]] = []
+def _area_table(configs: Sequence[Configuration], views: str, known: Sequence[Identity]) -> list[Block]:
+    head, windows, cells = ["method"], set(), {c.label: [c.label] for c in configs}
     for i in (i for metric in ON_THE_CURVE for i in known if i.metric == metric):
-        start, end = common_window([v for c in configs for (s, _), v in curves(c, i).items() if s in scenes])
-        if math.isfinite(start):
-            columns.append((i, start, end))
-    if not columns:
+        found = {c.label: curves(c, i) for c in configs}
+        start, end = common_window([curve for of_row in found.values() for curve in of_row.values()])
+        if not math.isfinite(start):
+            continue
+        head.append(i.display.head(i.region))
+        windows.add(f"{_seconds(start)} to {_seconds(end)}")
+        for label, of_row in found.items():
+            areas = [(scene, area_under_curve(curve, start, end)) for (scene, _), curve in of_row.items()]
+            by_scene = grouped((scene, area) for scene, area in areas if math.isfinite(area))
+            cells[label].append(i.display.text(mean_interval(by_scene, LEVEL).value) if by_scene else "—")
+    if not windows:
         return []
-    rows = [
-        (c.label, *(_area_cell(curves(c, i), i, start, end, scenes) for i, start, end in columns)) for c in configs
-    ]
-    head = [i.display.head(i.region) for i, _, _ in columns]
-    windows = sorted({f"{_seconds(start)} to {_seconds(end)}" for _, start, end in columns})
     note = (
-        f"Mean of the metric over the logarithm of fitting time, from {'; '.join(windows)}: from the latest first "
-        "checkpoint of any run to the end of the longest fit; a finished fit keeps its last value. Mean over scenes."
+        f"Mean of the metric over the logarithm of fitting time, from {'; '.join(sorted(windows))}: from the latest "
+        "first checkpoint of any run to the end of the longest fit; a finished fit keeps its last value. Mean over "
+        "scenes."
     )
     title = f"Area under the quality-time curve, on {views} test views"
-    return [Heading(3, title), Table(("method", *head), tuple(rows)), Paragraph(note)]
-
-
-def _area_cell(
-    found: Mapping[tuple[str, int], QualityCurve], identity: Identity, start: float, end: float, scenes: Sequence[str]
-) -> str:
-    areas = ((scene, area_under_curve(curve, start, end)) for (scene, _), curve in found.items() if scene in scenes)
-    by_scene = grouped((scene, area) for scene, area in areas if math.isfinite(area))
-    return identity.display.text(mean_interval(by_scene, LEVEL).value) if by_scene else "—"
+    return [Heading(3, title), Table(tuple(head), tuple(map(tuple, cells.values()))), Paragraph(note)]
 
 
 def _seconds(value: float, unit: str = " s") -> str:

@@ -264,7 +264,7 @@ def test_the_csv_holds_what_the_figure_shows(tmp_path):
     for png in drawn:
         assert png.with_suffix(".svg").read_text().startswith("<?xml")
     rows = list(csv.DictReader(drawn[0].with_suffix(".csv").open()))
-    points = work_points(configurations(runs), IDENTITIES[0], ["a", "b"])
+    points = work_points(configurations(runs), IDENTITIES[0])
     shown = {row["configuration"]: row for row in rows if row["identity"] == PSNR.format("body")}
     assert len(points) == len(shown) == 6
     for p in points:
