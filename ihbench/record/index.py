@@ -13,7 +13,7 @@ import sqlite3
 import time
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import closing, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
@@ -28,25 +28,10 @@ from ihbench.record.store import INDEX, KILLED, OUR_NAME
 from ihbench.version import __version__
 
 UNREADABLE = "unreadable"
-FILTERS = ("protocol", "scene", "method", "profile", "seed", "status")
 FILES = ("run.json", "scores.jsonl", "calibration.jsonl", "curve.jsonl")  # and presets/
 OURS = 0x69686265  # the database's application_id
-FORMER = b"CREATE TABLE about (signature TEXT"  # in the first page of an index of version 0.1
 WAIT = 10.0  # s for another process that writes the index
 FRESH = 10**8  # ns; files that have changed within this time are read again: they may change within the same tick
-
-SCHEMA = """
-CREATE TABLE about (made_by TEXT NOT NULL);
-CREATE TABLE runs (
-    folder BLOB PRIMARY KEY,  -- its name
-    signature TEXT NOT NULL,  -- of the files it was read from
-    protocol TEXT, scene TEXT, method TEXT, profile TEXT, seed INTEGER,  -- NULL when unreadable
-    status TEXT NOT NULL, reason TEXT NOT NULL, created TEXT,
-    proof INTEGER NOT NULL,  -- CRC-32 of the above
-    content BLOB  -- the run as JSON, compressed, NULL when unreadable
-);
-"""
-COLUMNS = "folder, signature, protocol, scene, method, profile, seed, status, reason, created"
 
 
 @dataclass(frozen=True)
@@ -68,14 +53,6 @@ class Entry:
     def name(self) -> str:
         return os.fsdecode(self.folder)
 
-    @property
-    def columns(self) -> tuple[Any, ...]:
-        return tuple(vars(self).values())
-
-    @property
-    def proof(self) -> int:
-        return zlib.crc32(repr(self.columns).encode("utf-8", "replace"))
-
     def matches(self, filters: Mapping[str, Any]) -> bool:
         for name, expected in filters.items():
             value = getattr(self, name)
@@ -84,6 +61,9 @@ class Entry:
             ):
                 return False
         return True
+
+
+COLUMNS = [field.name for field in fields(Entry)]  # of the database, and last the run as JSON, compressed
 
 
 class Index:
@@ -96,15 +76,15 @@ class Index:
     def query(self, **filters: Any) -> list[Entry]:
         """What the folders are, oldest first. A protocol matches with or without its @version.
 
-        Raises `BadInput` when there is no folder of runs, `ValueError` for an unknown filter.
+        Raises `BadInput` when there is no folder of runs.
         """
-        entries, _ = self._entries(filters)
+        entries, _ = self._entries()
         return [entry for entry in entries if entry.matches(filters)]
 
     def results(self, **filters: Any) -> tuple[list[RunResult], list[str]]:
         """The runs that match every filter, oldest first, and, one line each, the folders that are left out: damaged
         ones, whatever they were, and copies of a run that is there. Raises as `query` does."""
-        entries, read = self._entries(filters)
+        entries, read = self._entries()
         matching = [entry for entry in entries if entry.status != UNREADABLE and entry.matches(filters)]
         read |= self._stored_results([entry for entry in matching if entry.folder not in read])
         results, left_out = without_copies([read[entry.folder] for entry in matching])
@@ -113,11 +93,8 @@ class Index:
 
     # --- reading folders ---
 
-    def _entries(self, filters: Mapping[str, Any]) -> tuple[list[Entry], dict[bytes, RunResult]]:
+    def _entries(self) -> tuple[list[Entry], dict[bytes, RunResult]]:
         """All folders, oldest first, and of those that were read now the results."""
-        unknown = sorted(set(filters) - set(FILTERS))
-        if unknown:
-            raise ValueError(f"index: expected filters among {', '.join(FILTERS)}, got {', '.join(unknown)}")
         signatures = {os.fsencode(folder.name): signature(folder) for folder in self._folders()}
         stored = {entry.folder: entry for entry in self._stored()}
         entries, results = {}, {}
@@ -146,77 +123,65 @@ class Index:
     # --- the database ---
 
     def _stored(self) -> list[Entry]:
-        """What the database says that it can prove; nothing where there is none, or none of ours."""
-        with suppress(OSError, sqlite3.Error, OverflowError), closing(self._open("ro")) as database:
-            if not _is_current(database):
-                return []
-            rows = database.execute(f"SELECT {COLUMNS}, proof FROM runs").fetchall()
-            proven = [(_entry(row[:-1]), row[-1]) for row in rows]
-            return [entry for entry, proof in proven if entry is not None and entry.proof == proof]
+        with suppress(OSError, sqlite3.Error), self._database() as database:
+            return [Entry(*row) for row in database.execute(f"SELECT {', '.join(COLUMNS)} FROM runs")]
         return []
 
     def _stored_results(self, entries: Iterable[Entry]) -> dict[bytes, RunResult]:
         """The runs of entries that the database holds; what it has lost meanwhile is read from the folders."""
-        contents: dict[bytes, bytes] = {}
-        entry_of = {entry.folder: entry for entry in entries}
-        with suppress(OSError, sqlite3.Error), closing(self._open("ro")) as database:
-            for name, entry in entry_of.items():
-                row = database.execute(
-                    "SELECT content FROM runs WHERE folder = ? AND signature = ?", (name, entry.signature)
-                ).fetchone()
-                if row is not None:
-                    contents[name] = row[0]
-        return {
-            name: _unpacked(self.runs / entry.name, contents.get(name)) or read_result(self.runs / entry.name)
-            for name, entry in entry_of.items()
-        }
+        read: dict[bytes, RunResult] = {}
+        select = "SELECT content FROM runs WHERE folder = ? AND signature = ?"
+        with suppress(OSError, sqlite3.Error, zlib.error, TypeError), self._database() as database:
+            for entry in entries:
+                (packed,) = database.execute(select, (entry.folder, entry.signature)).fetchone()
+                content = from_json(json.loads(zlib.decompress(packed)), _Content)
+                read[entry.folder] = RunResult(self.runs / entry.name, **vars(content))
+        return {e.folder: read.get(e.folder) or read_result(self.runs / e.name) for e in entries}
 
     def _store(self, fresh: Iterable[Entry], gone: Iterable[bytes], results: Mapping[bytes, RunResult]) -> None:
-        """Bring the database up to date, as far as it may be written. What another process has put there meanwhile
-        stays or is replaced: each line proves by its signature what it was read from."""
+        """Bring the database up to date, as far as it may be written, or begin anew where it is damaged. What another
+        process has put there meanwhile stays or is replaced: each line has the signature of what it was read from."""
         rows = []
         for entry in fresh:
             content = results.get(entry.folder)
-            rows.append((*entry.columns, entry.proof, None if content is None else _packed(content)))
-        for attempt in range(2):
+            rows.append((*vars(entry).values(), None if content is None else _packed(content)))
+        for _ in range(2):
             try:
-                with closing(self._open("rwc")) as database, database:
-                    database.execute("BEGIN IMMEDIATE")
-                    if not _is_current(database):
-                        _make(database)
-                    marks = ", ".join("?" * (len(COLUMNS.split(",")) + 2))
+                with self._database(write=True) as database:
+                    marks = ", ".join("?" * (len(COLUMNS) + 1))
                     database.executemany(f"INSERT OR REPLACE INTO runs VALUES ({marks})", rows)
                     database.executemany("DELETE FROM runs WHERE folder = ?", [(name,) for name in gone])
                 return
-            except sqlite3.DatabaseError as error:
-                if attempt or isinstance(error, sqlite3.OperationalError) or not self._is_broken():
-                    return
-                removal.discard_file(self.file)  # of ours, and damaged
-            except (OSError, OverflowError):
+            except (OSError, sqlite3.OperationalError):
                 return
+            except sqlite3.DatabaseError:
+                removal.discard_file(self.file)
 
-    def _open(self, mode: str) -> sqlite3.Connection:
-        """The database in a file of our own; never one that a link or a pipe leads to. Raises `OSError`."""
-        if os.path.lexists(self.file) and (self.file.is_symlink() or not self.file.is_file()):
+    @contextmanager
+    def _database(self, write: bool = False) -> Iterator[sqlite3.Connection]:
+        """The database, emptied for writing where other code has filled it. Raises `OSError` for a file that is not
+        ours, a link or a pipe, and where there is nothing to read."""
+        if write and not os.path.lexists(self.file):
+            head = b""
+        elif self.file.is_symlink() or not self.file.is_file():
             raise OSError(f"{self.file}: is no plain file")
-        if mode == "ro" and not self.file.exists():
-            raise FileNotFoundError(self.file)
-        database = sqlite3.connect(
-            f"{self.file.resolve().as_uri()}?mode={mode}", uri=True, timeout=WAIT, isolation_level=None
-        )
-        database.text_factory = lambda data: data.decode("utf-8", "replace")
-        database.execute("PRAGMA synchronous = OFF")  # after a power cut what is lost or damaged is read again
-        return database
-
-    def _is_broken(self) -> bool:
-        """Whether the file is a damaged index, and nothing of anybody else's."""
-        try:
-            with open(self.file, "rb") as file:
-                head = file.read(4096)
-        except OSError:
-            return False
-        own = head[:15] == b"SQLite format 3" and int.from_bytes(head[68:72], "big") == OURS
-        return own or FORMER in head
+        else:
+            with self.file.open("rb") as file:
+                head = file.read(72)
+        if head and head[68:] != OURS.to_bytes(4, "big"):
+            raise OSError(f"{self.file}: is not an index of this bench")
+        with closing(sqlite3.connect(self.file, timeout=WAIT, isolation_level=None)) as database, database:
+            database.execute("PRAGMA synchronous = OFF")  # after a power cut what is lost or damaged is read again
+            if write:
+                database.execute("BEGIN IMMEDIATE")
+            if database.execute("PRAGMA user_version").fetchone()[0] != this_code():
+                if not write:
+                    raise OSError(f"{self.file}: of other code")
+                database.execute("DROP TABLE IF EXISTS runs")
+                database.execute(f"CREATE TABLE runs ({', '.join(COLUMNS)}, content, PRIMARY KEY (folder))")
+                database.execute(f"PRAGMA application_id = {OURS}")
+                database.execute(f"PRAGMA user_version = {this_code()}")
+            yield database
 
 
 @dataclass(frozen=True)
@@ -276,75 +241,21 @@ def read_entry(folder: Path, signed: str) -> tuple[Entry, RunResult | None]:
     return entry, result
 
 
-def _entry(row: tuple[Any, ...]) -> Entry | None:
-    """A line of the database, or None for one that nobody here has written."""
-    folder, signed, *texts, seed, status, reason, created = row
-    may_be_null = [*texts, created]
-    if not isinstance(folder, bytes) or not all(isinstance(text, str) for text in (signed, status, reason)):
-        return None
-    if not all(text is None or isinstance(text, str) for text in may_be_null) or not isinstance(seed, int | None):
-        return None
-    return Entry(*row)
-
-
-def _made_by(database: sqlite3.Connection) -> str | None:
-    """What code wrote the database; "" for an empty one, None for one that is not ours."""
-    if not database.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
-        return ""
-    if database.execute("PRAGMA application_id").fetchone()[0] == OURS:
-        row = database.execute("SELECT made_by FROM about").fetchone()
-        return "" if row is None else str(row[0])
-    tables = {row[0] for row in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-    columns = [row[1] for row in database.execute("PRAGMA table_info(about)")]
-    return "0.1" if tables == {"about", "runs", "scores"} and columns == ["signature"] else None
-
-
-def _is_current(database: sqlite3.Connection) -> bool:
-    columns = [row[1] for row in database.execute("PRAGMA table_info(runs)")]
-    return columns == [*COLUMNS.split(", "), "proof", "content"] and _made_by(database) == this_code()
-
-
-def _make(database: sqlite3.Connection) -> None:
-    """Begin anew inside a transaction. Raises `sqlite3.OperationalError` for a database that is not ours."""
-    if _made_by(database) is None:
-        raise sqlite3.OperationalError("not an index of this bench")
-    for table in ("about", "runs", "scores"):
-        database.execute(f"DROP TABLE IF EXISTS {table}")
-    for statement in SCHEMA.split(";")[:-1]:
-        database.execute(statement)
-    database.execute("INSERT INTO about VALUES (?)", (this_code(),))
-    database.execute(f"PRAGMA application_id = {OURS}")
-
-
 @cache
-def this_code() -> str:
+def this_code() -> int:
     """Changes with the code that reads run folders: what other code has read is read again."""
-    from ihbench.files import shape
-    from ihbench.metrics import aggregate, identity
-    from ihbench.record import migrations, results, store
-    from ihbench.record import schema as record
-
-    digest = hashlib.sha256(f"{__version__}\n{SCHEMA}".encode())
-    for module in (record, results, shape, store, migrations, aggregate, identity):
-        with suppress(OSError, TypeError):
-            digest.update(Path(module.__file__).read_bytes())  # type: ignore[arg-type]
-    with suppress(OSError):
-        digest.update(Path(__file__).read_bytes())
-    return digest.hexdigest()
+    bench = Path(__file__).parents[1]
+    files = [
+        file for name in ("*.py", "files/*.py", "metrics/*.py", "record/*.py") for file in sorted(bench.glob(name))
+    ]
+    code = __version__.encode() + b"".join(file.read_bytes() for file in files)
+    return int(hashlib.sha256(__version__.encode() + code).hexdigest()[:7], 16)
 
 
 def _packed(result: RunResult) -> bytes:
     return zlib.compress(
         json.dumps(as_json(_Content(**{f.name: getattr(result, f.name) for f in fields(_Content)}))).encode(), 1
     )
-
-
-def _unpacked(folder: Path, content: Any) -> RunResult | None:
-    """The inverse of `_packed`; None for what it cannot have made."""
-    try:
-        return RunResult(folder, **vars(from_json(json.loads(zlib.decompress(content)), _Content)))
-    except (zlib.error, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        return None
 
 
 def _printable(value: str) -> str:
