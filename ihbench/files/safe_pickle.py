@@ -4,8 +4,8 @@ A pickle is a program. This reader executes it with nothing to call but a handfu
 only build plain Python values and numpy arrays of numbers, text or objects. chumpy and scipy.sparse objects, which
 old SMPL files hold, come back as inert `ForeignObject`s that carry their state.
 
-Memory is bounded by the file's size: nothing is allocated that the file does not hold, and what shared references
-multiply is counted. So is the C stack: tuples nest only so deep. A file that is made to be slow can still be that.
+Memory is bounded by the file's size: nothing is allocated that the file does not hold, and bytes that are copied
+again and again are counted. A file that is made to be slow, or to nest deeply, can still be that.
 """
 
 from __future__ import annotations
@@ -25,10 +25,7 @@ from ihbench.errors import BadInput
 from ihbench.files.regular import opened
 
 LARGEST = 4 * 2**30  # bytes of a file
-# what a file may grow to: honest ones share little, and stay far below
-BYTES, BYTES_A_FILE_BYTE = 2**20, 64
-VALUES, VALUES_A_FILE_BYTE = 10**6, 100
-DEEPEST = 100  # tuples in tuples
+GROWTH = 64  # bytes copied for each byte of a file, at most: honest files share little, and stay far below
 
 
 class ForeignObject:
@@ -144,7 +141,7 @@ _INERT_PACKAGES = ("chumpy", "scipy.sparse")
 _LEAVES = (str, bytes, bytearray, int, float, complex, type(None), np.generic)
 _OPCODES = {opcode.code: opcode for opcode in pickletools.opcodes}
 _REFUSED = ("EXT1", "EXT2", "EXT4", "PERSID", "BINPERSID", "NEXT_BUFFER", "READONLY_BUFFER", "NEWOBJ_EX")
-_PUTS, _GETS = ("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"), ("GET", "BINGET", "LONG_BINGET")
+_PLACES = ("PUT", "BINPUT", "LONG_BINPUT", "GET", "BINGET", "LONG_BINGET")
 _LENGTHS = {  # how many bytes say how long an opcode's argument is
     pickletools.TAKEN_FROM_ARGUMENT1: 1,
     pickletools.TAKEN_FROM_ARGUMENT4: 4,
@@ -154,10 +151,8 @@ _LENGTHS = {  # how many bytes say how long an opcode's argument is
 
 
 def _check_opcodes(data: bytes) -> None:
-    """Refuse opcodes that no data file needs, sizes and places that the file does not hold, and deep tuples."""
+    """Refuse opcodes that no data file needs, and sizes and places that the file does not hold."""
     at = 0
-    depths: list[int] = []
-    memo: dict[int, int] = {}
     while data[at] != pickle.STOP[0]:
         opcode = _OPCODES[chr(data[at])]
         size = opcode.arg.n if opcode.arg else 0
@@ -173,35 +168,10 @@ def _check_opcodes(data: bytes) -> None:
         if opcode.name in _REFUSED:
             raise pickle.UnpicklingError("refused: an opcode that no data file needs")
         place = 0
-        if opcode.name in _PUTS or opcode.name in _GETS:
+        if opcode.name in _PLACES:
             place = int(data[start:at]) if size < 0 else int.from_bytes(data[start:at], "little")
         if max(at, place) >= len(data):
             raise pickle.UnpicklingError("pickle data was truncated")
-        _nest(opcode, place, depths, memo)
-
-
-def _nest(opcode: pickletools.OpcodeInfo, place: int, depths: list[int], memo: dict[int, int]) -> None:
-    """Follow how deep the tuples on the stack are nested, -1 for a mark: as a key, a deep one ends the process, as
-    its hash recurses in C without a guard. Where the stack lacks what an opcode takes, the unpickler says so."""
-    name, before = opcode.name, opcode.stack_before
-    if name in _PUTS:
-        memo[len(memo) if name == "MEMOIZE" else place] = depths[-1]
-    elif name in _GETS:
-        depths.append(memo[place])
-    elif not before:
-        depths += [-1 if name == "MARK" else 0] * len(opcode.stack_after)
-    else:
-        taken = []
-        if pickletools.markobject in before:
-            while (depth := depths.pop()) >= 0:
-                taken.append(depth)
-            before = before[: before.index(pickletools.markobject)]
-            taken.append(0)
-        taken += [depths.pop() for _ in before]
-        depth = max(taken) + 1 if name.startswith("TUPLE") else max(taken[-1], 0)  # others give the lowest back
-        if depth > DEEPEST:
-            raise pickle.UnpicklingError(f"refused: tuples nested more than {DEEPEST} deep")
-        depths += [depth] * len(opcode.stack_after)
 
 
 def _as_bytes(data: object) -> bytes | bytearray:
@@ -239,12 +209,11 @@ class SafeUnpickler(pickle.Unpickler):
     def __init__(self, data: bytes):
         _check_opcodes(data)
         super().__init__(io.BytesIO(data), encoding="latin1")  # maps the bytes of python-2 strings one to one
-        self._bytes = BYTES + BYTES_A_FILE_BYTE * len(data)
-        self._values = VALUES + VALUES_A_FILE_BYTE * len(data)
+        self._bytes = 2**20 + GROWTH * len(data)
         self._foreign: dict[tuple[str, str], type] = {}
-        # id -> (original, result, values in it), so that a value shared in many places is visited once; the original
-        # is there to keep its id taken
-        self._done: dict[int, tuple[Any, Any, int]] = {}
+        # id -> (original, result), so that a value shared in many places is visited once; the original is there to
+        # keep its id taken
+        self._done: dict[int, tuple[Any, Any]] = {}
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) in _ALLOWED:
@@ -256,10 +225,7 @@ class SafeUnpickler(pickle.Unpickler):
 
     def load(self) -> Any:
         """The value in the pickle, with real numpy arrays in it."""
-        value, count = self._resolve(super().load())
-        if count > self._values:
-            raise pickle.UnpicklingError("refused: a few values, referred to so often that they stand for too many")
-        return value
+        return self._resolve(super().load())
 
     def _spend(self, value: object) -> None:
         """Count bytes that are about to be copied from what the file may name again and again."""
@@ -270,46 +236,41 @@ class SafeUnpickler(pickle.Unpickler):
         if self._bytes < 0:
             raise pickle.UnpicklingError("refused: a small file that grows too large")
 
-    def _resolve(self, value: Any) -> tuple[Any, int]:
-        """The value with arrays in the place of records, and how many values it stands for."""
+    def _resolve(self, value: Any) -> Any:
+        """The value with arrays in the place of records."""
         if isinstance(value, _LEAVES):
-            return value, 1
+            return value
         if id(value) not in self._done:
             open_ended = isinstance(value, list | dict | ForeignObject)  # these may hold themselves
-            self._done[id(value)] = value, value if open_ended else _UNFINISHED, 1
-            self._done[id(value)] = value, *self._resolved(value)
-        _, result, count = self._done[id(value)]
+            self._done[id(value)] = value, value if open_ended else _UNFINISHED
+            self._done[id(value)] = value, self._resolved(value)
+        result = self._done[id(value)][1]
         if result is _UNFINISHED:
             raise pickle.UnpicklingError("refused an array or a tuple that holds itself")
-        return result, count
+        return result
 
-    def _resolved(self, value: Any) -> tuple[Any, int]:
-        if isinstance(value, list | tuple):
-            parts = [self._resolve(item) for item in value]
-            items, count = [item for item, _ in parts], 1 + sum(n for _, n in parts)
-            if isinstance(value, tuple):
-                return tuple(items), count
-            value[:] = items
-            return value, count
-        if isinstance(value, dict):
+    def _resolved(self, value: Any) -> Any:
+        if isinstance(value, tuple):
+            return tuple(map(self._resolve, value))
+        if isinstance(value, list):
+            value[:] = map(self._resolve, value)
+        elif isinstance(value, dict):
             _check_keys(value)
-            count = 1
             for key in value:
-                value[key], n = self._resolve(value[key])
-                count += n
-            return value, count
-        if isinstance(value, set | frozenset):
+                value[key] = self._resolve(value[key])
+        elif isinstance(value, set | frozenset):
             _check_keys(value)
-            return value, 1 + len(value)
-        if isinstance(value, ForeignObject):
-            return value, 1 + self._resolve(value.state)[1]
-        if isinstance(value, _ArrayRecord):
+        elif isinstance(value, ForeignObject):
+            self._resolve(value.state)
+        elif isinstance(value, _ArrayRecord):
             return self._array(*value.state)
-        if isinstance(value, _DtypeRecord):
-            return value.resolve(), 1
-        raise pickle.UnpicklingError("expected data, found a function")
+        elif isinstance(value, _DtypeRecord):
+            return value.resolve()
+        else:
+            raise pickle.UnpicklingError("expected data, found a function")
+        return value
 
-    def _array(self, shape: Any, record: Any, fortran: Any, data: Any) -> tuple[np.ndarray, int]:
+    def _array(self, shape: Any, record: Any, fortran: Any, data: Any) -> np.ndarray:
         if (
             not isinstance(shape, tuple)
             or not all(type(n) is int and 0 <= n < 2**63 for n in shape)
@@ -323,18 +284,17 @@ class SafeUnpickler(pickle.Unpickler):
         if dtype.hasobject:
             if not isinstance(data, list) or len(data) != count:
                 raise pickle.UnpicklingError(f"an object array of shape {shape} does not hold {count} objects")
-            flat, values = np.empty(count, object), 1
+            flat = np.empty(count, object)
             for i, item in enumerate(data):
-                flat[i], n = self._resolve(item)
-                values += n
-            return flat.reshape(shape, order=order), values
+                flat[i] = self._resolve(item)
+            return flat.reshape(shape, order=order)
         raw = _as_bytes(data)
         if len(raw) != count * dtype.itemsize or (count and not dtype.itemsize):
             raise pickle.UnpicklingError(
                 f"an array of shape {shape} and {dtype} needs {count * dtype.itemsize} bytes, the file has {len(raw)}"
             )
         array = np.frombuffer(raw, dtype, count) if count else np.zeros(0, dtype)
-        return np.array(array.reshape(shape, order=order), dtype=dtype.newbyteorder("="), order=order), 1
+        return np.array(array.reshape(shape, order=order), dtype=dtype.newbyteorder("="), order=order)
 
 
 def _check_keys(keys: Any) -> None:
