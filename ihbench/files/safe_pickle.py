@@ -14,10 +14,9 @@ import io
 import math
 import os
 import pickle
-import pickletools
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, ClassVar
 
 import numpy as np
 
@@ -139,39 +138,7 @@ _ALLOWED: dict[tuple[str, str], Callable] = {
 }
 _INERT_PACKAGES = ("chumpy", "scipy.sparse")
 _LEAVES = (str, bytes, bytearray, int, float, complex, type(None), np.generic)
-_OPCODES = {opcode.code: opcode for opcode in pickletools.opcodes}
-_REFUSED = ("EXT1", "EXT2", "EXT4", "PERSID", "BINPERSID", "NEXT_BUFFER", "READONLY_BUFFER", "NEWOBJ_EX")
-_PLACES = ("PUT", "BINPUT", "LONG_BINPUT", "GET", "BINGET", "LONG_BINGET")
-_LENGTHS = {  # how many bytes say how long an opcode's argument is
-    pickletools.TAKEN_FROM_ARGUMENT1: 1,
-    pickletools.TAKEN_FROM_ARGUMENT4: 4,
-    pickletools.TAKEN_FROM_ARGUMENT4U: 4,
-    pickletools.TAKEN_FROM_ARGUMENT8U: 8,
-}
-
-
-def _check_opcodes(data: bytes) -> None:
-    """Refuse opcodes that no data file needs, and sizes and places that the file does not hold."""
-    at = 0
-    while data[at] != pickle.STOP[0]:
-        opcode = _OPCODES[chr(data[at])]
-        size = opcode.arg.n if opcode.arg else 0
-        at += 1
-        if size == pickletools.UP_TO_NEWLINE:
-            start = at
-            for _ in range(2 if opcode.name in ("GLOBAL", "INST") else 1):
-                at = data.index(b"\n", at) + 1
-        else:
-            length = _LENGTHS.get(size, 0)
-            start, size = at + length, int.from_bytes(data[at : at + length], "little") if length else size
-            at = start + size
-        if opcode.name in _REFUSED:
-            raise pickle.UnpicklingError("refused: an opcode that no data file needs")
-        place = 0
-        if opcode.name in _PLACES:
-            place = int(data[start:at]) if size < 0 else int.from_bytes(data[start:at], "little")
-        if max(at, place) >= len(data):
-            raise pickle.UnpicklingError("pickle data was truncated")
+_REFUSED = (pickle.EXT1, pickle.EXT2, pickle.EXT4, pickle.NEWOBJ_EX)  # no data file needs these
 
 
 def _as_bytes(data: object) -> bytes | bytearray:
@@ -203,11 +170,14 @@ class _Allowed:
 _UNFINISHED: Any = object()
 
 
-class SafeUnpickler(pickle.Unpickler):
+class SafeUnpickler(pickle._Unpickler):  # in Python: it allocates nothing that the file does not hold
     """An unpickler that can only build plain values, numpy arrays and `ForeignObject`s."""
 
+    dispatch: ClassVar = {
+        code: load for code, load in pickle._Unpickler.dispatch.items() if bytes([code]) not in _REFUSED
+    }
+
     def __init__(self, data: bytes):
-        _check_opcodes(data)
         super().__init__(io.BytesIO(data), encoding="latin1")  # maps the bytes of python-2 strings one to one
         self._bytes = 2**20 + GROWTH * len(data)
         self._foreign: dict[tuple[str, str], type] = {}
