@@ -1,4 +1,5 @@
-"""The fields of options, configurations and protocols: how values are spelled, which fit, and their names and tables.
+"""The fields of options, configurations, protocols and records: how values are spelled, which fit, and their names
+and tables.
 
 Fields carry their bounds with their type, `Annotated[int, Within(1, 99)]`; `check` holds a value against both, `read`
 makes a typed value of what a TOML or JSON file has. A number without bounds of its own must be finite and below 2^63.
@@ -7,6 +8,7 @@ A dataclass in a dataclass has dotted names, as on the command line (`flat`), an
 
 from __future__ import annotations
 
+import math
 import re
 import types
 import unicodedata
@@ -27,7 +29,8 @@ STEPS = 10_000_000  # of an optimisation, at most
 WHOLE = re.compile(r"-?[0-9]{1,19}")
 REAL = re.compile(r"-?([0-9]+(\.[0-9]*)?|\.[0-9]+)(e[-+]?[0-9]{1,3})?|-?inf|nan", re.IGNORECASE)
 LONGEST_NAME, LONGEST_TEXT = 80, 2000  # characters
-MOST_ENTRIES = 10_000  # of a list
+LARGEST = 1e15  # of a measured number: far from where sums overflow or doubles skip whole numbers
+MORE = "more"  # the field of a dataclass for keys that it does not know
 
 Kind = TypeVar("Kind")
 Values = dict[str, Any]  # a field, named as `flat` names it -> its value, of any type
@@ -35,15 +38,20 @@ Values = dict[str, Any]  # a field, named as `flat` names it -> its value, of an
 
 @dataclass(frozen=True)
 class Within:
-    """The numbers from `low` to `high`; with `above`, `low` itself is not one of them."""
+    """The numbers from `low` to `high`; with `above`, `low` itself is not one of them. NaN and +infinity only where
+    they are named."""
 
-    low: float
-    high: float
+    low: float = -LARGEST
+    high: float = LARGEST
     above: bool = False
     words: str = ""
+    nan: bool = False
+    infinite: bool = False
 
     def holds(self, number: float) -> bool:
-        return self.low <= number <= self.high and not (self.above and number == self.low)  # never for NaN
+        if self.low <= number <= self.high:
+            return not (self.above and number == self.low)
+        return (self.nan and number != number) or (self.infinite and number == math.inf)
 
     def __str__(self) -> str:
         if self.words:
@@ -67,9 +75,10 @@ class MultipleOf:
 
 @dataclass(frozen=True)
 class Entries:
-    """Lists of `least` entries or more."""
+    """Lists of `least` to `most` entries."""
 
     least: int = 0
+    most: int = 10_000
 
 
 @dataclass(frozen=True)
@@ -77,7 +86,7 @@ class TextRule:
     """Texts for which `holds` does; in words."""
 
     words: str
-    holds: Callable[[str], bool]
+    holds: Callable[[str], object]
 
 
 def _is_folder_name(text: str) -> bool:
@@ -157,13 +166,15 @@ def fits(value: Any, hint: Any) -> bool:
         return fits(value, parts[0])
     if origin in (Union, types.UnionType):
         return any(fits(value, part) for part in parts)
+    if hint is Any:
+        return True
     if origin is Literal:
         return any(type(value) is type(part) and value == part for part in parts)
     if origin is tuple and len(parts) == 2 and parts[1] is Ellipsis:
         return isinstance(value, tuple) and all(fits(item, parts[0]) for item in value)
     if hint in (int, float):
         return isinstance(value, int if hint is int else int | float) and not isinstance(value, bool)
-    return not isinstance(hint, type) or isinstance(value, hint)
+    return isinstance(value, origin or hint)
 
 
 def expected(hint: Any) -> str:
@@ -194,6 +205,7 @@ def _flag(name: str, hint: Any) -> str:
     return next((word for word in named if isinstance(word, str)), name.replace("_", "-"))
 
 
+@cache
 def rules(hint: Any) -> tuple[Within | MultipleOf, ...]:
     """The bounds that stand beside a type, or inside it."""
     own = [word for word in getattr(hint, "__metadata__", ()) if isinstance(word, Within | MultipleOf)]
@@ -240,8 +252,7 @@ def is_config(value: Any) -> bool:
 
 
 def hints(kind: type) -> dict[str, object]:
-    """Name -> type of every field of a dataclass, nested ones as in `flat`; one that is written as a text (it has
-    `from_text`) is a value."""
+    """Name -> type of every field of a dataclass, nested ones as in `flat`; what is written as a text is a value."""
     out: dict[str, object] = {}
     own = _hints(kind)
     for field in fields(kind):
@@ -254,8 +265,8 @@ def hints(kind: type) -> dict[str, object]:
 
 
 def has_text(hint: Any) -> bool:
-    """Whether a type's values can be written as a text, which its `from_text` reads (raising `ValueError`)."""
-    return getattr(hint, "HAS_TEXT", False)
+    """Whether a type's values can be written as a text, which its `parse` reads (raising `ValueError`)."""
+    return getattr(hint, "HAS_TEXT", hasattr(hint, "parse"))
 
 
 def as_table(value: Any, kind: type | None = None) -> Any:
@@ -269,61 +280,84 @@ def as_table(value: Any, kind: type | None = None) -> Any:
     return [as_table(item) for item in value] if isinstance(value, tuple | list) else value
 
 
+def as_json(value: Any) -> Any:
+    """A value as a record has it: as `as_table`, but of fields that have their default only None is left out."""
+    if is_config(value):
+        known = [(field, getattr(value, field.name)) for field in fields(value) if field.name != MORE]
+        made = {f.name: as_json(item) for f, item in known if item is not None or f.default is not None}
+        return made | as_json(getattr(value, MORE, {}))
+    if isinstance(value, Mapping):
+        return {str(name): as_json(item) for name, item in value.items()}
+    return [as_json(item) for item in value] if isinstance(value, tuple | list) else value
+
+
 def read(hint: Any, value: Any, where: str, key: str = "", strict: bool = True) -> Any:
     """A value of a type from what TOML or JSON has of it; a dataclass from a table, or a text if it has one.
 
     Raises `BadInput` for the first part that is not of its type or out of bounds, named by its key: "where:
     image.size: expected …". `strict` refuses keys that a dataclass does not have; off for files that another version
-    may have written.
+    may have written: there a field `more` takes them.
     """
     if value is None and fits(value, hint):
         return None
-    if get_origin(hint) in (Union, types.UnionType):
-        some = [part for part in get_args(hint) if part is not type(None)]
-        hint = some[0] if len(some) == 1 else hint
-    plain, extras = (get_args(hint)[0], hint.__metadata__) if get_origin(hint) is Annotated else (hint, ())
-    origin, parts, at = get_origin(plain), get_args(plain), ": ".join(filter(None, (where, key)))
+    plain, origin, parts, marks, bounds = _taken_apart(hint)
     if has_text(plain) and isinstance(value, str):
         try:
-            return plain.from_text(value)
+            return plain.parse(value)
         except ValueError as error:
-            raise BadInput(f"{at}: {error}, found {shown(value)}") from error
+            raise BadInput(f"{_at(where, key)}: {error}, found {shown(value)}") from error
     if isinstance(plain, type) and is_dataclass(plain):
         return _read_fields(plain, value, where, key, strict)
-    if origin is Mapping:
+    if origin in (dict, Mapping):
         named = f"{key}, the name of an entry"
         return {
-            read(parts[0], name, where, named): read(parts[1], item, where, f"{key}.{name}", strict)
+            read(parts[0], name, where, named): read(parts[1], item, where, f"{key}.{name[:LONGEST_NAME]}", strict)
             for name, item in _table(value, where, key).items()
         }
     if origin is tuple:
         free = parts[-1] is Ellipsis
-        least = max([word.least for word in extras if isinstance(word, Entries)], default=0) if free else len(parts)
-        most = MOST_ENTRIES if free else least
+        sizes = next((mark for mark in marks if isinstance(mark, Entries)), Entries())
+        least, most = (sizes.least, sizes.most) if free else (len(parts), len(parts))
         if not isinstance(value, list | tuple) or not least <= len(value) <= most:
             count = f"{least} to {most}" if free else least
-            raise BadInput(f"{at}: expected a list of {count} entries, found {_shown(value)}")
+            raise BadInput(f"{_at(where, key)}: expected a list of {count} entries, found {_shown(value)}")
         kinds = parts[:1] * len(value) if free else parts
         entries = enumerate(zip(kinds, value, strict=True), 1)
         return tuple(read(kind, item, where, f"{key}, entry {k}", strict) for k, (kind, item) in entries)
-    words: list[Any] = [word for word in extras if isinstance(word, TextRule)]
-    bounds: list[Any] = [] if isinstance(value, bool | str) else [*rules(hint)]
-    if not (fits(value, hint) and all(rule.holds(value) for rule in bounds + words)):
-        raise BadInput(f"{at}: expected {words[0].words if words else expected(hint)}, found {_shown(value)}")
+    words: list[Any] = [mark for mark in marks if isinstance(mark, TextRule)]
+    limits = () if isinstance(value, bool) or not isinstance(value, int | float) else bounds
+    if not (fits(value, hint) and all(rule.holds(value) for rule in (*limits, *words))):
+        wanted = words[0].words if words else expected(hint)
+        raise BadInput(f"{_at(where, key)}: expected {wanted}, found {_shown(value)}")
     return value
+
+
+@cache
+def _taken_apart(hint: Any) -> tuple[Any, Any, tuple[Any, ...], tuple[Any, ...], tuple[Any, ...]]:
+    """A type without None and marks, its origin and parameters; its marks; the bounds of its numbers."""
+    some = [part for part in get_args(hint) if part is not type(None)]
+    own = some[0] if get_origin(hint) in (Union, types.UnionType) and len(some) == 1 else hint
+    plain, marks = (get_args(own)[0], own.__metadata__) if get_origin(own) is Annotated else (own, ())
+    return plain, get_origin(plain), get_args(plain), marks, rules(own) or (() if own is Any else (ANY_NUMBER,))
+
+
+def _at(where: str, key: str) -> str:
+    return ": ".join(filter(None, (where, key)))
 
 
 def _read_fields(kind: type[Kind], value: Any, where: str, key: str, strict: bool) -> Kind:
     table, inside = _table(value, where, key), f"{key}." if key else ""
-    known = {field.name: field for field in fields(kind)}  # type: ignore[arg-type]
+    known = {field.name: field for field in fields(kind) if field.name != MORE}  # type: ignore[arg-type]
     for name in table:
         if strict and name not in known:
             raise BadInput(f"{where}: unknown key {inside + name!r}: {nearest(name, list(known))}")
     for name, field in known.items():
         if name not in table and field.default is field.default_factory is MISSING:
-            raise BadInput(f"{where}: key {inside + name!r} is missing")
+            raise BadInput(f"{_at(where, f'key {inside + name!r}')} is missing")
     own = _hints(kind)
     given = {name: read(own[name], table[name], where, inside + name, strict) for name in known if name in table}
+    if MORE in own:
+        given[MORE] = {name: item for name, item in table.items() if name not in known}
     try:
         return kind(**given)
     except ValueError as error:
@@ -337,7 +371,7 @@ def _hints(kind: type) -> dict[str, object]:
 
 def _table(value: Any, where: str, key: str) -> Mapping[str, Any]:
     if not isinstance(value, Mapping):
-        raise BadInput(f"{where}: {key or 'the file'}: expected a table, found {_shown(value)}")
+        raise BadInput(f"{_at(where, key or 'the file')}: expected a table, found {_shown(value)}")
     return value
 
 

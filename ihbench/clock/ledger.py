@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Annotated, Any, TypedDict
 from ihbench.clock import interruption, machine
 from ihbench.clock.checkpoints import States, Tensors, Words, state_file
 from ihbench.clock.events import Event, Happening, Warned
+from ihbench.config_fields import TextRule, Within
 from ihbench.files.atomic import encode, write_bytes
-from ihbench.files.shape import WHOLE, Matches, Within
 
 if TYPE_CHECKING:
     from ihbench.clock.progress import Progress
@@ -34,9 +34,8 @@ ARTIFACTS = {"inpainting.png": "painted training views"}  # files that methods l
 
 Seconds = Annotated[float, Within(0)]
 Megabytes = Annotated[float, Within(0, nan=True)]  # NaN where the system does not tell
-StagePath = Annotated[
-    str, Matches(re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.+-]{0,99}(/[A-Za-z0-9][A-Za-z0-9 _.+-]{0,99}){0,9}"), "a stage")
-]  # fmt: skip
+_PART = r"[A-Za-z0-9][A-Za-z0-9 _.+-]{0,99}"
+StagePath = Annotated[str, TextRule("a stage", re.compile(rf"{_PART}(/{_PART}){{0,9}}").fullmatch)]
 OnCheckpoint = Callable[[int, float, Any], None]
 
 
@@ -48,7 +47,7 @@ class Stage:
     cpu_seconds: float = 0.0  # all threads of the process
     peak_mb: Megabytes = 0.0  # the process's peak when the stage last ended
     peak_device_mb: Megabytes | None = 0.0
-    entered: Annotated[int, Within(0, WHOLE)] = 0
+    entered: Annotated[int, Within(0, 2**63 - 1)] = 0
 
 
 class StageRow(TypedDict):

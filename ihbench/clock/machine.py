@@ -14,10 +14,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
-from ihbench.files.shape import Within
+from ihbench.config_fields import Entries, Within
 
 Cores = Annotated[int, Within(1, 1e6)]
-Loads = tuple[Annotated[float, Within(0)], ...]
+Loads = Annotated[tuple[Annotated[float, Within(0)], ...], Entries(1)]
 
 BUSY = 1.5  # load average per usable core above which other work was in the way: one run alone brings about 1
 

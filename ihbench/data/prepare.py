@@ -26,9 +26,9 @@ from ihbench.body import Body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.clock.progress import Progress
+from ihbench.config_fields import as_json, read
 from ihbench.errors import BadInput
 from ihbench.files import atomic, locks, removal
-from ihbench.files.shape import as_json, fault, from_json
 from ihbench.scene.contracts import MaskState, TrainView
 from ihbench.scene.views import OccludedScene
 from ihbench.version import __version__
@@ -111,11 +111,15 @@ class Manifest:
 def read_manifest(path: Path) -> Manifest:
     """Raises `BadInput` for a file that `prepare` has not written."""
     content = atomic.read_json(path)
-    wrong = fault(content, Manifest)
-    if wrong or not content["made_by"].startswith("ihbench "):
-        reason = wrong or f"made by {content['made_by'][:60]!r}"
-        raise BadInput(f"{path}: is no manifest of `ihbench prepare` ({reason}); name the folder that it has written")
-    return from_json(content, Manifest)
+    try:
+        manifest: Manifest = read(Manifest, content, "", strict=False)
+        if not manifest.made_by.startswith("ihbench "):
+            raise BadInput(f"made by {manifest.made_by[:60]!r}")
+    except BadInput as error:
+        raise BadInput(
+            f"{path}: is no manifest of `ihbench prepare` ({error}); name the folder that it has written"
+        ) from error
+    return manifest
 
 
 TrainingLayout = Callable[[Handout], Path]  # writes the files and returns the subject's folder

@@ -12,6 +12,9 @@ import math
 import re
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Annotated
+
+from ihbench.config_fields import Within
 
 
 @dataclass(frozen=True)
@@ -91,7 +94,7 @@ class Identity:
 class Score:
     """One number, what it is, and, when it is absent (NaN), why."""
 
-    value: float
+    value: Annotated[float, Within(nan=True, infinite=True)]
     identity: str
     reason: str = ""
 

@@ -19,9 +19,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from ihbench.config_fields import as_json, read
 from ihbench.errors import BadInput
 from ihbench.files import removal
-from ihbench.files.shape import as_json, from_json
 from ihbench.record.results import Rows, RunResult, read_result, without_copies
 from ihbench.record.schema import CurvePoint, RunRecord
 from ihbench.record.store import INDEX, KILLED, OUR_NAME
@@ -84,10 +84,10 @@ class Index:
     def results(self, **filters: Any) -> tuple[list[RunResult], list[str]]:
         """The runs that match every filter, oldest first, and, one line each, the folders that are left out: damaged
         ones, whatever they were, and copies of a run that is there. Raises as `query` does."""
-        entries, read = self._entries()
+        entries, fresh = self._entries()
         matching = [entry for entry in entries if entry.status != UNREADABLE and entry.matches(filters)]
-        read |= self._stored_results([entry for entry in matching if entry.folder not in read])
-        results, left_out = without_copies([read[entry.folder] for entry in matching])
+        fresh |= self._stored_results([entry for entry in matching if entry.folder not in fresh])
+        results, left_out = without_copies([fresh[entry.folder] for entry in matching])
         damaged = [f"{self.runs / entry.name}: {entry.reason}" for entry in entries if entry.status == UNREADABLE]
         return results, [*damaged, *left_out]
 
@@ -129,14 +129,14 @@ class Index:
 
     def _stored_results(self, entries: Iterable[Entry]) -> dict[bytes, RunResult]:
         """The runs of entries that the database holds; what it has lost meanwhile is read from the folders."""
-        read: dict[bytes, RunResult] = {}
+        kept: dict[bytes, RunResult] = {}
         select = "SELECT content FROM runs WHERE folder = ? AND signature = ?"
-        with suppress(OSError, sqlite3.Error, zlib.error, TypeError), self._database() as database:
+        with suppress(OSError, sqlite3.Error, zlib.error, TypeError, BadInput), self._database() as database:
             for entry in entries:
                 (packed,) = database.execute(select, (entry.folder, entry.signature)).fetchone()
-                content = from_json(json.loads(zlib.decompress(packed)), _Content)
-                read[entry.folder] = RunResult(self.runs / entry.name, **vars(content))
-        return {e.folder: read.get(e.folder) or read_result(self.runs / e.name) for e in entries}
+                content = read(_Content, json.loads(zlib.decompress(packed)), "", strict=False)
+                kept[entry.folder] = RunResult(self.runs / entry.name, **vars(content))
+        return {e.folder: kept.get(e.folder) or read_result(self.runs / e.name) for e in entries}
 
     def _store(self, fresh: Iterable[Entry], gone: Iterable[bytes], results: Mapping[bytes, RunResult]) -> None:
         """Bring the database up to date, as far as it may be written, or begin anew where it is damaged. What another

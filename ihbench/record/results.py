@@ -9,10 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from ihbench.config_fields import Values
+from ihbench.config_fields import Values, as_json
 from ihbench.errors import BadInput
 from ihbench.files import atomic
-from ihbench.files.shape import as_json
 from ihbench.metrics import Identity, Mean, Score, mean_over_frames
 from ihbench.record.schema import (
     About,

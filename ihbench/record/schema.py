@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from hashlib import sha256
@@ -18,11 +18,10 @@ from typing import Annotated, Any, Literal
 from ihbench.clock.events import Event
 from ihbench.clock.ledger import LedgerState, Megabytes, Seconds
 from ihbench.clock.machine import Machine
-from ihbench.config_fields import Values
+from ihbench.config_fields import TextRule, Values, Within, as_json, read
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.regular import read_bytes
-from ihbench.files.shape import WHOLE, Matches, Within, as_json, fault, from_json
 from ihbench.metrics.identity import Identity
 from ihbench.record.provenance import Provenance
 from ihbench.scene.plan import Omission
@@ -35,21 +34,17 @@ HASH_LENGTH = 10
 Status = Literal["running", "done", "diverged", "failed", "interrupted", "skipped", "timeout"]
 
 
-@dataclass(frozen=True)
-class _Time:
-    """A moment with its time zone, as ISO 8601 has it."""
-
-    def fault(self, value: str) -> str:
-        try:
-            aware = datetime.fromisoformat(value).tzinfo is not None
-        except ValueError:
-            aware = False
-        return "" if aware else f"is {value[:60]!a}, expected a time such as 2025-01-31T12:00:00+00:00"
+def _is_time(text: str) -> bool:
+    """Whether it is a moment with its time zone, as ISO 8601 has it."""
+    try:
+        return datetime.fromisoformat(text).tzinfo is not None
+    except ValueError:
+        return False
 
 
-Count = Annotated[int, Within(0, WHOLE)]
-Moment = Annotated[str, _Time()]
-Words = Annotated[str, Matches(re.compile(r"(?s).{1,1000}"), "a name of 1 to 1000 letters")]
+Count = Annotated[int, Within(0, 2**63 - 1)]
+Moment = Annotated[str, TextRule("a time such as 2025-01-31T12:00:00+00:00", _is_time)]
+Words = Annotated[str, TextRule("a name of 1 to 1000 letters", lambda text: 1 <= len(text) <= 1000)]
 Scores = Mapping[Identity, Annotated[float, Within(-1e12, 1e12, nan=True, infinite=True)]]
 Json = Mapping[str, Any]
 
@@ -185,12 +180,12 @@ class About:
 
     @property
     def subjects(self) -> Subjects:
-        return from_json((self.protocol or {}).get("subjects", {}), Subjects)
+        return read(Subjects, (self.protocol or {}).get("subjects", {}), "", strict=False)
 
     @property
     def image_size(self) -> int:
         """px; 0 where the record does not say."""
-        return from_json((self.protocol or {}).get("image", {}), Image).size
+        return read(Image, (self.protocol or {}).get("image", {}), "", strict=False).size
 
 
 def value_text(name: str, value: Any) -> str:
@@ -270,10 +265,16 @@ def read_json(file: Path, largest: int = LARGEST_RECORD) -> Any:
     return _parsed(file, _content(file, largest))
 
 
-def read_lines(file: Path, kind: Any) -> list[Any]:
-    """The lines of one file of a run folder, each as the dataclass `kind`. Raises `BadInput` as `read_json` does, and
-    for a line of another shape."""
-    return [from_json(line, kind) for line in _lines(file, lambda number: kind)]
+def read_lines(file: Path, kind: Any, first: Any = None) -> list[Any]:
+    """The lines of one file of a run folder, each as the dataclass `kind`; the first one as `first`, if that is
+    given. Raises `BadInput` as `read_json` does, and for a line of another shape."""
+    lines: list[Any] = []
+    for number, text in enumerate(_content(file, LARGEST_TABLE).split("\n"), 1):
+        if text.strip():
+            where = f", line {number}"
+            own = kind if lines or first is None else first
+            lines.append(read(own, _parsed(file, text, where), f"{file}{where}", strict=False))
+    return lines
 
 
 def score_lines(file: Path) -> list[ScoreLine]:
@@ -284,27 +285,15 @@ def score_lines(file: Path) -> list[ScoreLine]:
 
 def preset_lines(file: Path) -> tuple[PresetHead, list[ScoreLine]]:
     """What a preset's file of scores begins with, and its score lines. Raises `BadInput` as `score_lines` does."""
-    first, *lines = _lines(file, lambda number: PresetHead if number == 0 else ScoreLine) or [None]
-    if first is None:
+    head, *lines = read_lines(file, ScoreLine, first=PresetHead) or [None]
+    if head is None:
         raise BadInput(f"{file}: is empty")
-    return from_json(first, PresetHead), _each_view_once(file, [from_json(line, ScoreLine) for line in lines])
+    return head, _each_view_once(file, lines)
 
 
 def curve_points(file: Path) -> list[CurvePoint]:
     """Quality-time points, step by step. Raises `BadInput` as `read_lines` does."""
     return read_lines(file, CurvePoint)
-
-
-def _lines(file: Path, kind_of: Callable[[int], Any]) -> list[Any]:
-    """The JSON of the lines, of the kind that their number among the lines asks for."""
-    lines: list[Any] = []
-    for number, text in enumerate(_content(file, LARGEST_TABLE).split("\n"), 1):
-        if text.strip():
-            line = _parsed(file, text, f", line {number}")
-            if wrong := fault(line, kind_of(len(lines))):
-                raise BadInput(f"{file}, line {number}: {wrong}")
-            lines.append(line)
-    return lines
 
 
 def _each_view_once(file: Path, lines: list[ScoreLine]) -> list[ScoreLine]:
@@ -317,20 +306,12 @@ def _each_view_once(file: Path, lines: list[ScoreLine]) -> list[ScoreLine]:
     return lines
 
 
-def record_fault(record: Any) -> str:
-    """Where a run record of this schema version is not what it should be; "" where it is."""
-    if wrong := fault(record, RunRecord):
-        return wrong
-    for path, value, kind in (
-        ("identity.config", record["identity"]["config"], _ConfigShape),
-        ("about.protocol", record["about"].get("protocol") or {}, _ProtocolShape),
-    ):
-        if wrong := fault(value, kind):
-            return f"{path}.{wrong}"
-    for name in ("load_average", "load_average_end"):
-        if record["machine"].get(name) == []:
-            return f"machine.{name} is empty"
-    return ""
+def read_record(record: Any, where: str) -> RunRecord:
+    """run.json of this schema version. Raises `BadInput` where it is not what it should be."""
+    made: RunRecord = read(RunRecord, record, where, strict=False)
+    read(_ConfigShape, made.identity.config, where, "identity.config", strict=False)
+    read(_ProtocolShape, made.about.protocol or {}, where, "about.protocol", strict=False)
+    return made
 
 
 def outcome_fault(record: RunRecord) -> str:

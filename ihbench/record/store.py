@@ -26,9 +26,9 @@ from ihbench.clock import machine
 from ihbench.clock.checkpoints import is_saved_state
 from ihbench.clock.interruption import undisturbed
 from ihbench.clock.ledger import ARTIFACTS, Ledger
+from ihbench.config_fields import as_json
 from ihbench.errors import BadInput
 from ihbench.files import atomic, locks, removal
-from ihbench.files.shape import as_json, from_json
 from ihbench.record.migrations import MIGRATIONS
 from ihbench.record.provenance import provenance
 from ihbench.record.schema import (
@@ -43,7 +43,7 @@ from ihbench.record.schema import (
     Status,
     curve_points,
     read_json,
-    record_fault,
+    read_record,
 )
 
 NOTHING = About()
@@ -118,7 +118,7 @@ class RunFolder:
         record = RunRecord(
             identity.digest, outcome, identity, about, machine.identity(), provenance(), warnings=warnings
         )
-        run = cls(path, from_json(atomic.decode(atomic.encode(as_json(record))), RunRecord))  # as it is read again
+        run = cls(path, read_record(atomic.decode(atomic.encode(as_json(record))), str(path)))  # as it is read again
         run.save()
         return run
 
@@ -307,12 +307,13 @@ def _checked(file: Path, record: Any) -> RunRecord:
     while version < SCHEMA_VERSION:
         version, record = version + 1, MIGRATIONS[version](record)
     record = {**record, "schema_version": version}
-    if wrong := record_fault(record):
-        raise DamagedRecord(f"{file}: {wrong}; run the same command with --force")
-    read: RunRecord = from_json(record, RunRecord)
-    if read.identity.digest != read.digest:
+    try:
+        made = read_record(record, str(file))
+    except BadInput as error:
+        raise DamagedRecord(f"{error}; run the same command with --force") from error
+    if made.identity.digest != made.digest:
         raise BadInput(f"{file}: its identity is not the one of its digest: edited, or of another run; restore it")
-    return read
+    return made
 
 
 def _free_name(path: Path) -> Path:

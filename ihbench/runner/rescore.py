@@ -12,10 +12,10 @@ from pathlib import Path
 from numpy.typing import NDArray
 
 from ihbench.clock.progress import Progress
+from ihbench.config_fields import as_json
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.images import read_image
-from ihbench.files.shape import as_json
 from ihbench.metrics.evaluate import Preset, find_preset
 from ihbench.record.finished_run import FinishedRun
 from ihbench.record.results import view_rows

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.clock.progress import Progress
+from ihbench.config_fields import as_json
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.images import write_png
-from ihbench.files.shape import as_json
 from ihbench.metrics.eight_bit import displayed
 from ihbench.record.results import group_row, view_rows
 from ihbench.record.schema import ScoreLine, score_lines

@@ -9,9 +9,9 @@ from pathlib import Path
 from ihbench.clock.checkpoints import saved_meta, state_file
 from ihbench.clock.events import Event
 from ihbench.clock.machine import Machine
+from ihbench.config_fields import as_json
 from ihbench.errors import BadInput
 from ihbench.files import atomic
-from ihbench.files.shape import as_json
 from ihbench.record.schema import RunIdentity
 from ihbench.record.store import RunFolder
 

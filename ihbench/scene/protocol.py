@@ -59,8 +59,6 @@ LONGEST_CHANGE = 60  # characters of a value in a version; a digest stands for l
 class Span:
     """start, stop, step of frames; `stop` may be the name of a per-subject limit. Raises `ValueError` for none."""
 
-    HAS_TEXT: ClassVar[bool] = True
-
     start: Frame
     stop: Frame | Literal["max_frames"]
     step: Step
@@ -73,7 +71,7 @@ class Span:
             )
 
     @classmethod
-    def from_text(cls, text: str) -> Span:
+    def parse(cls, text: str) -> Span:
         """A span from "0:500:5", "0::2" or "100:"."""
         parts = text.split(":")
         try:
@@ -124,8 +122,6 @@ class TestCameras(Cameras):
 class OwnFrames:
     """A subject's own training and test frames: start, stop, step."""
 
-    HAS_TEXT: ClassVar[bool] = True
-
     train: tuple[Frame, Frame, Frame]
     test: tuple[Frame, Frame, Frame]
 
@@ -134,9 +130,9 @@ class OwnFrames:
             Span(*own)
 
     @classmethod
-    def from_text(cls, text: str) -> OwnFrames:
+    def parse(cls, text: str) -> OwnFrames:
         """From "0:500:5,500:617:10"."""
-        spans = [Span.from_text(part) for part in text.split(",")]
+        spans = [Span.parse(part) for part in text.split(",")]
         if len(spans) != 2 or any(span.stop == "max_frames" for span in spans):
             raise ValueError("expected training and test frames, for example 0:500:5,500:617:10")
         train, test = ((span.start, int(span.stop), span.step) for span in spans)
@@ -181,19 +177,17 @@ class TestGroup:
     """Further test views, scored apart from the protocol's own."""
 
     __test__ = False
-    HAS_TEXT: ClassVar[bool] = True
-
     name: Name  # what a table calls it, for example "train = test"
     cameras: Cameras
     frames: Span
 
     @classmethod
-    def from_text(cls, text: str) -> TestGroup:
+    def parse(cls, text: str) -> TestGroup:
         """From "train = test,0:1,0:100:2"."""
         name, *spans = text.rsplit(",", 2)
         if len(spans) != 2:
             raise ValueError('expected NAME,CAMERAS,FRAMES, for example "train = test,0:1,0:100:2"')
-        cameras, frames = Span.from_text(spans[0]), Span.from_text(spans[1])
+        cameras, frames = Span.parse(spans[0]), Span.parse(spans[1])
         return cls(name, Cameras(cameras.start, cameras.stop, cameras.step), frames)
 
 

@@ -17,9 +17,9 @@ from typing import Any
 from ihbench.cli import main
 from ihbench.clock.events import Inpainted, Resumed
 from ihbench.clock.ledger import Ledger
+from ihbench.config_fields import as_json
 from ihbench.errors import BadInput
 from ihbench.files import atomic
-from ihbench.files.shape import as_json
 from ihbench.record.finished_run import FinishedRun, earlier_runs
 from ihbench.record.index import Index
 from ihbench.record.results import read_result

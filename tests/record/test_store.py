@@ -17,9 +17,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ihbench.clock.ledger import Ledger
+from ihbench.config_fields import as_json
 from ihbench.errors import BadInput
 from ihbench.files import locks
-from ihbench.files.shape import as_json
 from ihbench.metrics import Identity
 from ihbench.record import schema, store
 from ihbench.record.schema import About, CurvePoint, PresetHead, RunRecord, ScoreLine, score_lines
@@ -256,7 +256,7 @@ def test_the_curve_grows_and_can_be_rewound(tmp_path):
     (run.path / "curve.jsonl").write_text("{}\n")
     run.add_curve_point(CurvePoint(9, 9.0, {}))  # the fit goes on beside a damaged file
     assert [point.step for point in run.curve()] == [9]
-    assert "step is missing" in run.record.warnings[0]
+    assert "'step' is missing" in run.record.warnings[0]
 
 
 def test_warnings_are_kept_once(tmp_path):

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from ihbench.clock.machine import Machine
+from ihbench.config_fields import as_json
 from ihbench.files import atomic
-from ihbench.files.shape import as_json
 from ihbench.metrics import Identity, Mean
 from ihbench.record.provenance import Provenance
 from ihbench.record.results import RunResult

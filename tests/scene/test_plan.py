@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ihbench.body import texel_table
 from ihbench.body.pose import BodyPose
-from ihbench.config_fields import flat, with_fields
-from ihbench.files.shape import as_json
+from ihbench.config_fields import as_json, flat, with_fields
 from ihbench.methods.inpainthuman import config as method_config
 from ihbench.methods.inpainthuman.config import (
     LEAST_TEXELS,
