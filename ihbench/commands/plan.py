@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -33,45 +33,8 @@ class PlanOptions(SceneChoice, Printing):
     """As `ihbench run` takes them."""
 
 
-@dataclass(frozen=True)
-class LeftOut:
-    """An `Omission`, and what it saves."""
-
-    field: str
-    value: Any
-    reason: str
-    spares: Mapping[str, float]
-    seconds: float | None
-
-
-@dataclass(frozen=True)
-class ScenePlan:
-    measure: SceneMeasure
-    left_out: tuple[LeftOut, ...]
-
-
-@dataclass(frozen=True)
-class NotMeasured:
-    note: str
-
-
-@dataclass(frozen=True)
-class Plan:
+def _planned(chosen: SceneChoice, protocol: Protocol) -> dict[str, Any]:
     """Of a run under one protocol."""
-
-    protocol: str
-    profile: str
-    method: str
-    data: str
-    expected_seconds_per_scene: float | None
-    earlier_runs: int
-    earlier_runs_had_other_switches: bool
-    earlier_runs_had_other_code: bool
-    config: Any  # the method's
-    scenes: Mapping[str, ScenePlan | NotMeasured]
-
-
-def _planned(chosen: SceneChoice, protocol: Protocol) -> Plan:
     from ihbench.clock.machine import cpu_model
     from ihbench.record.finished_run import earlier_runs
     from ihbench.record.source_digest import code_of
@@ -85,10 +48,10 @@ def _planned(chosen: SceneChoice, protocol: Protocol) -> Plan:
     source = locate(protocol, chosen.data, chosen.scene)
     code = code_of(protocol, chosen.method)
     earlier = earlier_runs(chosen.runs, chosen.method, protocol.name, chosen.profile, cpu_model(), code)
-    scenes: dict[str, ScenePlan | NotMeasured] = {}
+    scenes: dict[str, dict[str, Any]] = {}
     for scene in source.scenes:
         if not source.exists(scene):
-            scenes[scene] = NotMeasured("stand-in not made yet: the run makes it; measured then")
+            scenes[scene] = {"note": "stand-in not made yet: the run makes it; measured then"}
             continue
         capture, _ = open_capture(protocol.dataset, source.root, scene, chosen.body)
         where = f"{capture.dataset} {capture.name}"
@@ -98,38 +61,50 @@ def _planned(chosen: SceneChoice, protocol: Protocol) -> Plan:
         except BadInput as error:
             if not source.is_standin:
                 raise
-            scenes[scene] = NotMeasured(f"the run makes the rest of this stand-in; measured then: {error}")
+            scenes[scene] = {"note": f"the run makes the rest of this stand-in; measured then: {error}"}
             continue
         stages = {} if earlier is None else earlier.stages
         needless = method_spec(chosen.method).omissions(config, measure)
-        omissions = needless + absent_regions(measure, protocol.metrics.regions)
-        left_out = tuple(LeftOut(o.field, o.value, o.reason, o.spares, o.seconds(stages)) for o in omissions)
-        scenes[scene] = ScenePlan(measure, left_out)
-    data = "stand-in" if source.is_standin else str(source.root)
-    before = (None, 0, False, False)
-    if earlier is not None:
-        before = earlier.seconds, earlier.count, not earlier.same_switches, not earlier.same_code
-    return Plan(protocol.name, chosen.profile, chosen.method, data, *before, config, scenes)
+        left_out = [
+            {name: getattr(o, name) for name in ("field", "value", "reason", "spares")}
+            | {"seconds": o.seconds(stages)}
+            for o in needless + absent_regions(measure, protocol.metrics.regions)
+        ]
+        scenes[scene] = {"measure": measure, "left_out": left_out}
+    return {
+        "protocol": protocol.name,
+        "profile": chosen.profile,
+        "method": chosen.method,
+        "data": "stand-in" if source.is_standin else str(source.root),
+        "expected_seconds_per_scene": None if earlier is None else earlier.seconds,
+        "earlier_runs": 0 if earlier is None else earlier.count,
+        "earlier_runs_had_other_switches": earlier is not None and not earlier.same_switches,
+        "earlier_runs_had_other_code": earlier is not None and not earlier.same_code,
+        "config": config,
+        "scenes": scenes,
+    }
 
 
-def _blocks(plan: Plan) -> list[Block]:
-    on = f"{plan.method} under {plan.protocol}, {plan.profile} profile, on {plan.data}"
-    seconds = plan.expected_seconds_per_scene
+def _blocks(plan: Mapping[str, Any]) -> list[Block]:
     expected = "unknown, no earlier run of this protocol on such a processor to go by"
-    if seconds:
-        which = f"{plan.earlier_runs} earlier run{'s' * (plan.earlier_runs > 1)} of this protocol"
-        others = " with other switches" if plan.earlier_runs_had_other_switches else ""
-        others += " by other code" if plan.earlier_runs_had_other_code else ""
-        expected = f"{seconds:.0f} s per scene, the median of {which} on such a processor{others}"
-    blocks: list[Block] = [Paragraph(on), Paragraph(f"expected: {expected}")]
-    for scene, found in plan.scenes.items():
-        blocks += [Heading(2, scene), *bullets([found.note] if isinstance(found, NotMeasured) else _lines(found))]
+    if plan["expected_seconds_per_scene"]:
+        count = plan["earlier_runs"]
+        others = " with other switches" * plan["earlier_runs_had_other_switches"]
+        others += " by other code" * plan["earlier_runs_had_other_code"]
+        which = f"{count} earlier run{'s' * (count > 1)} of this protocol on such a processor{others}"
+        expected = f"{plan['expected_seconds_per_scene']:.0f} s per scene, the median of {which}"
+    blocks: list[Block] = [
+        Paragraph("{method} under {protocol}, {profile} profile, on {data}".format(**plan)),
+        Paragraph(f"expected: {expected}"),
+    ]
+    for scene, found in plan["scenes"].items():
+        lines = [found["note"]] if "note" in found else _lines(found["measure"], found["left_out"])
+        blocks += [Heading(2, scene), *bullets(lines)]
     return blocks
 
 
-def _lines(plan: ScenePlan) -> list[str]:
+def _lines(m: SceneMeasure, left_out: Sequence[Mapping[str, Any]]) -> list[str]:
     """What was measured of a scene, and what is left out."""
-    m = plan.measure
     lines = [
         f"{m.training_views} training views ({m.covered_views} occluded), {m.test_views} test views",
         f"occlusion {_rule(m.occlusion)}: hides {m.hidden_share:.0%} of the person in occluded views",
@@ -144,12 +119,12 @@ def _lines(plan: ScenePlan) -> list[str]:
         f"joints move up to {m.motion_deg:.0f}°, the person turns {m.turn_deg:.0f}°",
         f"a pixel of the protocol's image covers {m.pixel_mm:.1f} mm of the body",
     ]
-    for o in plan.left_out:
-        saved = f" (saves about {o.seconds:.0f} s)" if o.seconds is not None else ""
-        lines.append(f"left out: {o.field} -> {o.value}: {o.reason}{saved}")
-    if any(o.value is not None for o in plan.left_out):
+    for o in left_out:
+        saved = f" (saves about {o['seconds']:.0f} s)" if o["seconds"] is not None else ""
+        lines.append(f"left out: {o['field']} -> {o['value']}: {o['reason']}{saved}")
+    if any(o["value"] is not None for o in left_out):
         lines.append("`ihbench run --keep FIELD` keeps what the plan would change, `--keep all` everything")
-    return lines if plan.left_out else [*lines, "left out: nothing; this scene needs all of it"]
+    return lines if left_out else [*lines, "left out: nothing; this scene needs all of it"]
 
 
 def _rule(occlusion: Mapping[str, str | float]) -> str:
