@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -42,22 +42,7 @@ class Filters(_Seed, Printing):
     """Only runs that are running, done, diverged, failed, interrupted, skipped, timeout or damaged."""
 
 
-@dataclass(frozen=True)
-class RunLine:
-    """What is said of one run."""
-
-    status: str
-    protocol: str | None  # None of damaged ones, as far as `created`
-    scene: str | None
-    method: str | None
-    profile: str | None
-    seed: int | None
-    reason: str
-    created: str | None
-    identity: str | None  # of the headline number
-    value: float | None
-    bytes: int
-    folder: str
+RunLine = dict[str, Any]  # what is said of one run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,11 +113,11 @@ def _remove(chosen: Remove) -> int:
     if bool(chosen.run) == bool(_filters(chosen)):
         raise BadInput("runs rm: either name run folders, or choose some by filters such as --status failed")
     rows = list(_named(chosen)) if chosen.run else _matching(chosen)
-    written = [row for row in rows if writer_of(Path(row.folder)) is not None]
+    written = [row for row in rows if writer_of(Path(row["folder"])) is not None]
     if written and chosen.run:
-        raise BadInput(f"{written[0].folder}: is being written; wait for it to end. Nothing was removed")
+        raise BadInput(f"{written[0]['folder']}: is being written; wait for it to end. Nothing was removed")
     for row in written:
-        print(f"ihbench: not removed, is being written: {row.folder}", file=sys.stderr)
+        print(f"ihbench: not removed, is being written: {row['folder']}", file=sys.stderr)
     rows = [row for row in rows if row not in written]
     if not rows:
         raise BadInput(f"no run under {chosen.runs} matches that can be removed; see ihbench runs list")
@@ -141,10 +126,10 @@ def _remove(chosen: Remove) -> int:
         return 1
     removed, kept = [], {}
     for row in rows:
-        left = remove_run(Path(row.folder))
-        removed.append(row.folder)
+        left = remove_run(Path(row["folder"]))
+        removed.append(row["folder"])
         if left is not None:
-            kept[row.folder] = str(left)
+            kept[row["folder"]] = str(left)
             print(f"ihbench: kept, since the bench did not write it: {left}", file=sys.stderr)
     if chosen.json:
         print(json.dumps({"removed": removed, "kept": kept}))
@@ -199,12 +184,16 @@ def _named(chosen: Remove) -> Iterator[RunLine]:
 def _row(folder: Path, entry: Entry, result: RunResult | None) -> RunLine:
     from ihbench.record.index import UNREADABLE
 
-    name, value = _headline(result)
-    status = DAMAGED if entry.status == UNREADABLE else entry.status
-    return RunLine(
-        status, entry.protocol, entry.scene, entry.method, entry.profile, entry.seed, entry.reason, entry.created,
-        name, value, _size(folder), str(folder),
-    )  # fmt: skip
+    identity, value = _headline(result)
+    entry_fields = ("protocol", "scene", "method", "profile", "seed", "reason", "created")  # None of damaged ones
+    return {
+        "status": DAMAGED if entry.status == UNREADABLE else entry.status,
+        **{name: getattr(entry, name) for name in entry_fields},
+        "identity": identity,
+        "value": value,
+        "bytes": _size(folder),
+        "folder": str(folder),
+    }
 
 
 def _headline(result: RunResult | None) -> tuple[str | None, float | None]:
@@ -233,10 +222,11 @@ def _cells(row: RunLine) -> tuple[str, ...]:
     from ihbench.errors import visible
     from ihbench.metrics import Identity
 
-    value = "" if row.identity is None or row.value is None else Identity.parse(row.identity).display.text(row.value)
-    named = (row.status, row.protocol, row.scene, row.method, row.profile, row.seed)
+    identity = row["identity"]
+    value = Identity.parse(identity).display.text(row["value"]) if identity else ""
+    named = (row[name] for name in ("status", "protocol", "scene", "method", "profile", "seed"))
     texts = ("" if text is None else visible(str(text)) for text in named)
-    return (*texts, value, _age(row.created), _bytes(row.bytes), visible(row.folder))
+    return (*texts, value, _age(row["created"]), _bytes(row["bytes"]), visible(row["folder"]))
 
 
 def _age(created: str | None) -> str:
@@ -257,4 +247,4 @@ def _bytes(number: float) -> str:
 
 
 def _counted(rows: list[RunLine]) -> str:
-    return f"{len(rows)} run{'s' * (len(rows) != 1)}, {_bytes(sum(row.bytes for row in rows))}"
+    return f"{len(rows)} run{'s' * (len(rows) != 1)}, {_bytes(sum(row['bytes'] for row in rows))}"

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ihbench.document.document import Block, Bullets, Column, Heading, Number, Paragraph, Table, plain_text
+from ihbench.document.document import Block, Bullets, Heading, Number, Paragraph, Table, plain_text
 from ihbench.errors import visible
 
 FORMULA = ("=", "+", "-", "@", "\t", "\r")  # what a spreadsheet runs
@@ -46,10 +46,27 @@ def _sentences(blocks: Sequence[Block]) -> Iterator[tuple[str, str]]:
                 yield under, plain_text(words)
 
 
-def write_cells(about: Mapping[str, str], tables: Sequence[Table], footnotes: Mapping[str, str]) -> str:
-    """One line for each number of the tables: `about` all of them, its row and column, and what it is worth. Absent
-    numbers are empty; footnotes are in words."""
-    return write_rows([{**about, **cell} for table in tables for cell in _cells(table, footnotes)], [*about])
+def write_cells(name: str, tables: Sequence[Table], footnotes: Mapping[str, str]) -> str:
+    """One line for each number of the tables: its row and column, and what it is worth. Absent numbers are empty;
+    footnotes are in words."""
+    cells = (
+        {
+            "table": name,
+            "block": table.title,
+            "kind": table.kind,
+            "row": label.name,
+            "section": label.section,
+            "calibration": "yes" if label.bound else "no",
+            "group": column.group,
+            "metric": column.metric.title,
+            "unit": column.metric.unit,
+            **_number(number, footnotes),
+        }
+        for table in tables
+        for k, label in enumerate(table.labels)
+        for column, number in zip(table.columns, table.numbers(k), strict=True)
+    )
+    return write_rows([*cells], ["table"])
 
 
 def write_rows(rows: Sequence[Mapping[str, Any]], first: Sequence[str] = ()) -> str:
@@ -63,35 +80,17 @@ def write_rows(rows: Sequence[Mapping[str, Any]], first: Sequence[str] = ()) -> 
     return out.getvalue()
 
 
-def _cells(table: Table, footnotes: Mapping[str, str]) -> Iterator[dict[str, object]]:
-    columns = [cell for cell in table.head if isinstance(cell, Column)]
-    for k, label in enumerate(table.labels):
-        for column, number in zip(columns, table.numbers(k), strict=True):
-            yield {
-                "block": table.title,
-                "kind": table.kind,
-                "row": label.name,
-                "section": label.section,
-                "calibration": "yes" if label.bound else "no",
-                "group": column.group,
-                "metric": column.metric.title,
-                "unit": column.metric.unit,
-                **_number(number, footnotes),
-            }
-
-
 def table_data(table: Table, footnotes: Mapping[str, str]) -> dict[str, object]:
     """A table of numbers as plain data."""
     head = [plain_text(cell) for cell in table.head]
     ticks = slice(table.left, table.left + table.ticks)
-    columns = [cell for cell in table.head if isinstance(cell, Column)]
     return {
         "title": table.title,
         "kind": table.kind,
         "components": head[ticks],
         "columns": [
             {"group": c.group, "metric": c.key, "title": c.title, "higher_is_better": c.metric.higher_is_better}
-            for c in columns
+            for c in table.columns
         ],
         "rows": [
             {

@@ -8,6 +8,7 @@ reasons) goes in as it is.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -135,8 +136,11 @@ class Table:
     @property
     def groups(self) -> dict[str, int]:
         """Name -> number of columns of the groups of columns."""
-        names = [cell.group for cell in self.head if isinstance(cell, Column)]
-        return {name: names.count(name) for name in names}
+        return dict(Counter(column.group for column in self.columns))
+
+    @property
+    def columns(self) -> list[Column]:
+        return [cell for cell in self.head if isinstance(cell, Column)]
 
     def begins_section(self, k: int) -> bool:
         return bool(self.labels) and k > 0 and self.labels[k].section != self.labels[k - 1].section

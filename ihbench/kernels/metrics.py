@@ -182,18 +182,13 @@ def frame_rows(repeats: int, size: int = SIZE) -> list[Row]:
 def _framed_person(extent: tuple[float, float], height: int, width: int, dtype: type = np.float32) -> Case:
     """The figure of `person_case` in the middle of a frame of which it takes this share of the height and width."""
     inner = person_case(int(height * extent[0]), int(width * extent[1]), dtype)
-    top, left = (height - inner.truth.shape[0]) // 2, (width - inner.truth.shape[1]) // 2
-    area = np.s_[top : top + inner.truth.shape[0], left : left + inner.truth.shape[1]]
-    images = []
-    for image in (inner.pred, inner.truth):
-        whole = np.full((height, width, 3), 255 if dtype == np.uint8 else 1, dtype)
-        whole[area] = image
-        images.append(whole)
-    regions = {name: np.zeros((height, width), np.bool_) for name in inner.regions}
-    for name, mask in inner.regions.items():
-        regions[name][area] = mask
-    regions["full"][:] = True
-    return Case(f"framed {inner.name}", images[0], images[1], regions)
+    rows, columns = inner.truth.shape[:2]
+    top, left = (height - rows) // 2, (width - columns) // 2
+    around = (top, height - rows - top), (left, width - columns - left)
+    white = 255 if dtype == np.uint8 else 1
+    pred, truth = (np.pad(x, (*around, (0, 0)), constant_values=white) for x in (inner.pred, inner.truth))
+    regions = {name: np.pad(mask, around, constant_values=name == "full") for name, mask in inner.regions.items()}
+    return Case(f"framed {inner.name}", pred, truth, regions)
 
 
 def _compared(

@@ -10,7 +10,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from itertools import compress
+from typing import Literal
+
+import numpy as np
 
 from ihbench.document.document import Block, Heading, Number, Paragraph, RowLabel, Span, Table, bullets, emphasis
 from ihbench.document.marks import marks_by_interval, marks_by_value
@@ -104,16 +107,13 @@ def _columns_of(table: PaperTable, choice: Choice) -> PaperTable:
     """The table with the chosen metrics alone."""
     if not choice.metrics:
         return table
-    quoted = [column for group in table.groups if not group.measured_only for column in group.columns]
+    kept = [choice.has_metric(column.key) for column in table.columns]
+    rows = tuple(replace(row, cells=tuple(compress(row.cells, kept))) for row in table.rows)
     groups = [
         replace(group, columns=tuple(column for column in group.columns if choice.has_metric(column.key)))
         for group in table.groups
     ]
-    rows = []
-    for row in table.rows:
-        cells = [c for c, column in zip(row.cells, quoted, strict=True) if choice.has_metric(column.key)]
-        rows.append(replace(row, cells=tuple(cells)))
-    return replace(table, groups=tuple(group for group in groups if group.columns), rows=tuple(rows))
+    return replace(table, groups=tuple(group for group in groups if group.columns), rows=rows)
 
 
 def _named(table: Table, names: Mapping[str, str], footnotes: Footnotes) -> Table:
@@ -154,15 +154,14 @@ def _quoted(table: PaperTable, footnotes: Footnotes, as_printed: bool, choice: C
         rows.append((row.name, status, *(YES if has else NO for has in row.components), *cells))
     own, others = (any(row[1] == status for row in rows) for status in ("reported", "quoted"))
     absent = any(cell.status == "absent" for row in table.rows for cell in row.cells)
+    marked = "computed from the printed values alone: the paper gives no intervals, so none of them is known to be"
     notes = [
-        *(["reported: the paper about its own method."] if own else []),
-        *(["quoted: the paper about somebody else's method."] if others else []),
-        *(["—: not available in the paper."] if absent else []),
-        "Marks are the paper's own." if as_printed else
-        "Marks are computed from the printed values alone: the paper gives no intervals, so none of them is known to "
-        "be beyond chance.",
+        *["reported: the paper about its own method."] * own,
+        *["quoted: the paper about somebody else's method."] * others,
+        *["—: not available in the paper."] * absent,
+        "Marks are the paper's own." if as_printed else f"Marks are {marked} beyond chance.",
         *(group.note for group in table.groups if group.note and not group.measured_only),
-    ]  # fmt: skip
+    ]
     parts = [part.name for part in table.components if not part.measured_only]
     return Table(
         (table.head, "status", *parts, *table.columns),
@@ -295,19 +294,10 @@ def _measured_block(
 
 def _identity(done: Sequence[RunResult], group: Group, metric: str, region: str) -> Identity | None:
     """The first definition of a metric in a region that these runs have; one with numbers before one without."""
-    identities = [
-        identity
-        for run in done
-        for identity in run.rows.get(group_row(run.method, group.views), {})
-        if identity.metric == metric and identity.region == region
-    ]
-    present = [i for i in identities if any(not m.absent for m in _means(done, i, group.views))]
+    rows = [run.rows.get(group_row(run.method, group.views), {}) for run in done]
+    identities = [i for row in rows for i in row if (i.metric, i.region) == (metric, region)]
+    present = [i for i in identities if any(i in row and not row[i].absent for row in rows)]
     return next(iter(present or identities), None)
-
-
-def _means(runs: Sequence[RunResult], identity: Identity, views: str) -> list[Mean]:
-    rows = [run.rows.get(group_row(run.method, views), {}) for run in runs]
-    return [row[identity] for row in rows if identity in row]
 
 
 def _cell(
@@ -335,11 +325,9 @@ def _bound(
     column: Column, done: Sequence[RunResult], row: str, identity: Identity | None, kind: Kind, footnotes: Footnotes
 ) -> Number:
     """A calibration row's cell: the same for every run on a scene."""
-    means = {} if identity is None else scene_means(done, identity, row)
-    if identity is None or not means:
+    if identity is None or not (means := scene_means(done, identity, row)):
         return _absent(f"not scored on {column.group}", footnotes)
-    cell = _filled(column, means, identity, kind, footnotes)
-    return replace(cell, interval="", low=math.nan, high=math.nan)
+    return replace(_filled(column, means, identity, kind, footnotes), interval="", low=math.nan, high=math.nan)
 
 
 def _filled(
@@ -406,11 +394,7 @@ def _component(component: Component, runs: Sequence[RunResult]) -> str:
         all(switches[name] for name in component.on)
         and all(switches[name] == value for name, value in component.equal.items())
         and not any(switches.get(name) for name in component.off)
-        and (not component.several or _several(switches[component.several]))
+        and (not component.several or len(np.atleast_1d(switches[component.several])) > 1)
         for switches in (run.switches for run in runs)
     }
     return UNKNOWN if len(states) != 1 else YES if states.pop() else NO
-
-
-def _several(value: Any) -> bool:
-    return isinstance(value, list | tuple) and len(value) > 1

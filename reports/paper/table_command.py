@@ -81,7 +81,7 @@ def written(frame: Frame, form: str, fragment: bool = False) -> str:
     if form not in ("csv", "json"):
         return document.write(frame.blocks, form)
     if form == "csv":
-        return csv.write_cells({"table": frame.name}, frame.tables, frame.footnotes)
+        return csv.write_cells(frame.name, frame.tables, frame.footnotes)
     content = {
         "table": frame.name,
         "title": frame.title,
@@ -103,8 +103,7 @@ def _results(chosen: TableOptions, protocols: list[str]) -> tuple[list[RunResult
         if chosen.runs != TableOptions.runs:
             raise BadInput(f"--runs {chosen.runs}: no such folder; give a folder of runs or leave it out")
         return [], []
-    filters = {name: getattr(chosen, name) for name in ("method", "profile")}
-    filters = {name: value for name, value in filters.items() if value is not None}
+    filters = {name: value for name in ("method", "profile") if (value := getattr(chosen, name)) is not None}
     results: list[RunResult] = []
     left_out: list[str] = []
     for protocol in dict.fromkeys(protocols):
