@@ -87,7 +87,7 @@ def _check_out(out: Path) -> None:
     names = sorted(name for name in (*PARTS, CARD, FIGURES, TRAINING) if os.path.lexists(out / name))
     if not names or (state.is_file() and not state.is_symlink()):
         return
-    if names == [TRAINING] and set(os.listdir(out / TRAINING)) <= {CURVE, "lock", "lock.owner"}:
+    if names == [TRAINING] and set(os.listdir(out / TRAINING)) <= {CURVE, "lock", "lock.owner", "lock.claim"}:
         return  # stopped before its first state was saved
     try:
         check_mini(out)

@@ -432,7 +432,11 @@ def remove_run(path: Path) -> Path | None:
 
 def is_record(path: Path) -> bool:
     """Whether what has this path in a run folder belongs to the run; an exported avatar does not."""
-    return (path.name != "avatar.ply" and _is_ours(path)) or path.as_posix() in (LOCK, LOCK + locks.OWNER)
+    return (path.name != "avatar.ply" and _is_ours(path)) or path.as_posix() in (
+        LOCK,
+        LOCK + locks.OWNER,
+        LOCK + locks.CLAIM,
+    )
 
 
 def _now() -> str:

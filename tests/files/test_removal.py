@@ -50,7 +50,6 @@ def test_only_one_module_removes():
                     found.setdefault(path.relative_to(ROOT).as_posix(), set()).add(name)
     assert found == {
         "ihbench/files/atomic.py": {"os.replace"},
-        "ihbench/files/locks.py": {"os.rename", "unlink"},
         "ihbench/data/prepare.py": {"os.rename", "rmdir"},
         "ihbench/files/removal.py": {"os.replace", "rmdir", "shutil.rmtree", "unlink"},
         "ihbench/record/store.py": {"os.rename", "rmdir"},
