@@ -1,4 +1,4 @@
-"""OcMotion as its authors released it: read, check and write the folder with `annot/`.
+"""OcMotion as its authors released it: read and check the folder with `annot/`.
 
     annot/train.pkl, annot/test.pkl     [sequence][camera][frame] = {img_path, h_w, "0": person, "1": person, …}
     images/0011/02/00001.jpg            whatever img_path says, relative to the folder that holds annot/
@@ -29,13 +29,12 @@ from ihbench.body import Body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera, off_orthogonal
 from ihbench.datasets.reading.capture_folder import CaptureFolder
-from ihbench.datasets.reading.pickles import write_pickle
 from ihbench.datasets.reading.plausibility import readable
-from ihbench.datasets.reading.stored_numbers import described, numbers, stored_camera
+from ihbench.datasets.reading.stored_numbers import described, numbers
 from ihbench.datasets.reading.subject_folders import SubjectFolders, View, count_files
 from ihbench.errors import BadInput
 from ihbench.files.paths import user_path
-from ihbench.files.pictures import read_mask, size_of, write_picture
+from ihbench.files.pictures import read_mask, size_of
 from ihbench.files.safe_pickle import load_pickle
 from ihbench.scene.copy_report import SubjectReport
 
@@ -193,7 +192,7 @@ class OcMotionCapture(OneCameraCapture):
         self._images = tuple(root / path for path in paths)
         self._masks = tuple(root / mask_file(path, track.suffix) for path in paths)
         self._annotated_size = _one_size(track)
-        self._people = [(_person(frame, track.person, where), where) for frame, where in track.frames]
+        self._people = [({str(k): frame[k] for k in frame}[track.person], where) for frame, where in track.frames]
         self._K, self._E = one_camera(self._people, "intri", "extri")
 
     def body_pose(self, frame: int) -> BodyPose:
@@ -233,7 +232,8 @@ def _tracks(path: Path, _version: tuple[int, int, int]) -> dict[str, _Track]:
                         f"{where}, frame {f}: expected a dictionary with img_path, h_w and one entry a person, "
                         f"found {described(frame)}"
                     )
-            people = sorted({str(key) for frame in frames for key in frame} - {"img_path", "h_w"}, key=_by_number)
+            people = {str(key) for frame in frames for key in frame} - {"img_path", "h_w"}
+            people = sorted(people, key=lambda key: (not key.isdecimal(), len(key), key))  # 10 after 9
             for k, person in enumerate(people):
                 own = [(frame, f"{where}, frame {f}") for f, frame in enumerate(frames) if person in map(str, frame)]
                 suffix = f"_p{person}" if k else ""
@@ -256,17 +256,6 @@ def _listed(value: Any, where: str, expected: str) -> list:
     return list(value)
 
 
-def _by_number(key: str) -> tuple[int, str]:
-    return (int(key), "") if key.isdecimal() else (10**9, key)
-
-
-def _person(frame: dict, person: str, where: str) -> Mapping:
-    value = next(value for key, value in frame.items() if str(key) == person)
-    if not isinstance(value, dict):
-        raise BadInput(f"{where}: expected a dictionary for person {person}, found {described(value)}")
-    return value
-
-
 def _image_name(frame: dict, where: str) -> str:
     """The image's path below the root. Raises `BadInput` when it leads out of it."""
     path = frame["img_path"]
@@ -278,26 +267,16 @@ def _image_name(frame: dict, where: str) -> str:
     return PurePosixPath(path).as_posix()
 
 
-def _height_width(frame: dict, where: str) -> tuple[int, int]:
-    try:
-        height, width = (int(side) for side in frame["h_w"])
-    except (TypeError, ValueError, OverflowError):
-        height = width = 0
-    if height < 1 or width < 1:
-        raise BadInput(f"{where}: expected (height, width) px in 'h_w', found {str(frame['h_w'])[:60]!r}")
-    return height, width
-
-
 def _one_size(track: _Track) -> tuple[int, int]:
     """(width, height) px of all frames."""
-    height, width = _height_width(*track.frames[0])
-    for frame, where in track.frames:
-        if _height_width(frame, where) != (height, width):
+    sizes = np.stack([numbers(frame, "h_w", (2,), where) for frame, where in track.frames]).astype(int)
+    for size, (_, where) in zip(sizes, track.frames, strict=True):
+        if (size != sizes[0]).any() or size.min() < 1:
             raise BadInput(
-                f"{where}: h_w is {frame['h_w']}, ({height}, {width}) at the first frame; expected one image size "
-                f"for a camera"
+                f"{where}: h_w is {tuple(size.tolist())}, {tuple(sizes[0].tolist())} at the first frame; expected "
+                f"one (height, width) px for a camera"
             )
-    return width, height
+    return int(sizes[0, 1]), int(sizes[0, 0])
 
 
 def mask_file(img_path: str, suffix: str = "") -> str:
@@ -373,64 +352,6 @@ def check_calibration(K: Array, E: Array, where: str) -> None:
             f"{where}: the camera stands {np.linalg.norm(E[:3, 3]):.4g} from the origin; expected metres, divide the "
             f"extrinsics' t by 1000 if it is in millimetres"
         )
-
-
-# ----------------------------------------------------------------------------------------------- write
-
-
-@dataclass(frozen=True)
-class AnnotPerson:
-    """One person in one image."""
-
-    body_pose: BodyPose  # standard root, world, 10 shape coefficients
-    bbox: NDArray[np.floating]  # [2, 2] px, (x1, y1) and (x2, y2)
-    joints_2d: NDArray[np.floating]  # [n, 2 or more] px, x and y first
-
-
-@dataclass(frozen=True)
-class AnnotFrame:
-    """One image of the annotations."""
-
-    img_path: str  # relative to the data folder, e.g. images/0011/02/00001.jpg
-    camera: Camera  # without distortion
-    people: Mapping[str, AnnotPerson]  # keys "0", "1", …
-
-
-def write_annot(path: Path, sequences: Sequence[Sequence[Sequence[AnnotFrame]]]) -> None:
-    """annot/train.pkl or annot/test.pkl: [sequence][camera][frame]. `OcMotionOriginal` reads it back exactly."""
-    write_pickle(path, [[[_entry(frame) for frame in camera] for camera in sequence] for sequence in sequences])
-
-
-def _entry(frame: AnnotFrame) -> dict[str, object]:
-    K, E = stored_camera(frame.camera, "OcMotion")
-    people = {
-        key: {
-            "bbox": np.array(person.bbox, np.float64),
-            "lsp_joints_2d": np.array(person.joints_2d, np.float64),
-            "pose": person.body_pose.pose.reshape(72).copy(),
-            "betas": ten_betas(person.body_pose),
-            "trans": person.body_pose.transl.copy(),
-            "intri": K.copy(),
-            "extri": E.copy(),
-        }
-        for key, person in frame.people.items()
-    }
-    return {"img_path": frame.img_path, "h_w": (frame.camera.height, frame.camera.width), **people}
-
-
-def write_frame(
-    root: Path,
-    img_path: str,  # as the annotations list it
-    image: NDArray[np.uint8] | None = None,  # [H, W, 3] RGB
-    visible_mask: NDArray | None = None,  # [H, W] non-zero = visible person
-    suffix: str = "",  # "_p1" for the mask of a further person "1"
-) -> None:
-    """The picture files of one frame: the image as its name says (JPEG of quality 95, or PNG), the mask as 8-bit PNG
-    of three channels, 0 and 255. None is not written."""
-    if image is not None:
-        write_picture(root / img_path, image)
-    if visible_mask is not None:
-        write_picture(root / mask_file(img_path, suffix), three_channels(visible_mask))
 
 
 def three_channels(

@@ -17,13 +17,15 @@ from PIL import Image
 from ihbench import registry
 from ihbench.body import load_body
 from ihbench.data.prepare import HandedView, Handout
-from ihbench.datasets.ocmotion import original as ocmotion
+from ihbench.datasets.ocmotion.original import mask_file
 from ihbench.datasets.people_snapshot import gaussianavatar
 from ihbench.datasets.people_snapshot import original as people_snapshot
 from ihbench.datasets.plain import plain_scene
 from ihbench.errors import BadInput
 from ihbench.files import atomic
+from ihbench.files.pictures import write_picture
 from tests.bench.fake_capture import SIZE, the_body, turning_capture
+from tests.datasets.test_ocmotion import annot_frame, write_annots
 
 NAME = "male-3-casual"
 N = 3
@@ -70,10 +72,10 @@ def released_ocmotion(scene: Handout) -> Path:
     frames = []
     for view in scene.views():
         path = f"images/0011/02/{view.number:05d}.png"
-        person = ocmotion.AnnotPerson(view.body_pose, np.zeros((2, 2)), np.zeros((14, 3)))
-        frames.append(ocmotion.AnnotFrame(path, view.camera, {"0": person}))
-        ocmotion.write_frame(scene.folder, path, view.image, view.visible)
-    ocmotion.write_annot(scene.folder / "annot/train.pkl", [[frames]])
+        frames.append(annot_frame(path, view.camera, {"0": view.body_pose}))
+        write_picture(scene.folder / path, view.image)
+        write_picture(scene.folder / mask_file(path), view.visible * np.uint8(255))
+    write_annots(scene.folder, [[frames]])
     return scene.folder
 
 

@@ -19,11 +19,12 @@ from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera, look_at
 from ihbench.datasets.ocmotion import original as ocmotion
 from ihbench.datasets.ocmotion import wild2avatar as ocmotion_w2a
-from ihbench.datasets.ocmotion.original import AnnotFrame, AnnotPerson, OcMotionOriginal
+from ihbench.datasets.ocmotion.original import OcMotionOriginal, mask_file
 from ihbench.datasets.ocmotion.wild2avatar import OcMotionW2a
 from ihbench.datasets.reading.stored_numbers import stored_camera
 from ihbench.errors import BadInput
 from ihbench.files import atomic
+from ihbench.files.pictures import write_picture
 from ihbench.render.zbuffer import rasterize
 
 WIDTH, HEIGHT = 128, 96
@@ -101,28 +102,37 @@ def path_of(camera: int, frame: int) -> str:
     return f"images/0011/{camera:02d}/{frame + 1:05d}.jpg"
 
 
-def annot_frames(camera: int, cameras, poses, people=("0",)) -> list[AnnotFrame]:
-    person = {
-        frame: {
-            key: AnnotPerson(
-                BodyPose(poses[frame].pose, poses[frame].betas, poses[frame].transl + int(key) * np.array([1, 0, 0])),
-                np.array([[10.0, 20], [30 + frame, 40]]),
-                np.full((14, 3), 5.0 + frame),
-            )
-            for key in people
+def annot_frame(path: str, camera: Camera, people: dict[str, BodyPose]) -> dict:
+    K, E = stored_camera(camera, "OcMotion")
+    frame: dict = {"img_path": path, "h_w": (camera.height, camera.width)}
+    for key, pose in people.items():
+        parameters = {"pose": pose.pose.reshape(72), "betas": pose.betas, "trans": pose.transl}
+        frame[key] = {
+            "bbox": np.zeros((2, 2)),
+            "lsp_joints_2d": np.zeros((14, 3)),
+            "intri": K,
+            "extri": E,
+            **parameters,
         }
-        for frame in range(len(poses))
-    }
-    return [AnnotFrame(path_of(camera, frame), cameras[camera], person[frame]) for frame in range(len(poses))]
+    return frame
+
+
+def annot_frames(camera: int, cameras, poses, people=("0",)) -> list[dict]:
+    frames = []
+    for frame, pose in enumerate(poses):
+        beside = {key: dataclasses.replace(pose, transl=pose.transl + np.array([int(key), 0, 0])) for key in people}
+        frames.append(annot_frame(path_of(camera, frame), cameras[camera], beside))
+    return frames
 
 
 def write_original(root: Path, body) -> Written:
     cameras, poses, images = make_cameras(), make_poses(), make_images()
     masks = visible_masks(cameras[OWN], poses, body)
     sequence = [annot_frames(1, cameras, poses, ("0", "1")), annot_frames(OWN, cameras, poses)]
-    ocmotion.write_annot(root / "annot" / "train.pkl", [sequence])
+    write_annots(root, [sequence])
     for frame, (image, mask) in enumerate(zip(images, masks, strict=True)):
-        ocmotion.write_frame(root, path_of(OWN, frame), image, mask)
+        write_picture(root / path_of(OWN, frame), image)
+        write_picture(root / mask_file(path_of(OWN, frame)), ocmotion.three_channels(mask))
     return Written(root, cameras, poses, images, masks)
 
 
@@ -167,6 +177,7 @@ def annots(release: Path):
 
 
 def write_annots(release: Path, content, split: str = "train") -> None:
+    (release / "annot").mkdir(parents=True, exist_ok=True)
     (release / "annot" / f"{split}.pkl").write_bytes(pickle.dumps(content))
 
 
@@ -586,31 +597,6 @@ def test_symlink_loops_do_no_harm(sequence, release):
 # --------------------------------------------------------------------------------- the original release
 
 
-def test_stored_annotations_are_as_chomp_reads_them(original, smpl):
-    frame = annots(original.root)[0][1][2]
-    assert (frame["img_path"], tuple(frame["h_w"])) == ("images/0011/02/00003.jpg", (HEIGHT, WIDTH))
-    person = frame["0"]
-    assert {key: value.shape for key, value in person.items()} == {
-        "bbox": (2, 2),
-        "lsp_joints_2d": (14, 3),
-        "pose": (72,),
-        "betas": (10,),
-        "trans": (3,),
-        "intri": (3, 3),
-        "extri": (4, 4),
-    }
-    camera, vertices = original.cameras[OWN], smpl.pose(original.poses[2])
-    seen = vertices @ person["extri"][:3, :3].T + person["extri"][:3, 3]
-    pixels = seen @ person["intri"].T
-    np.testing.assert_allclose(pixels[:, :2] / pixels[:, 2:] + 0.5, camera.project(vertices)[:, :2])
-    assert b"numpy._core" not in (original.root / "annot" / "train.pkl").read_bytes()
-
-
-def test_png_images_are_exact(tmp_path, original):
-    ocmotion.write_frame(tmp_path, "images/a/b.png", original.images[1])
-    np.testing.assert_array_equal(np.array(Image.open(tmp_path / "images/a/b.png")), original.images[1])
-
-
 def test_people_of_one_camera_are_subjects(release, original):
     dataset = OcMotionOriginal(release)
     assert dataset.subjects() == ["0011_01", "0011_01_p1", "0011_02"]
@@ -618,7 +604,7 @@ def test_people_of_one_camera_are_subjects(release, original):
     np.testing.assert_allclose(second.body_pose(0).transl - first.body_pose(0).transl, [1, 0, 0])
     assert first.mask_path(0, 0) == release / "masks/0011/01/00001.png"
     assert second.mask_path(0, 0) == release / "masks/0011/01/00001_p1.png"
-    ocmotion.write_frame(release, path_of(1, 0), original.images[0], original.masks[0], "_p1")
+    write_picture(release / mask_file(path_of(1, 0), "_p1"), ocmotion.three_channels(original.masks[0]))
     np.testing.assert_array_equal(second.silhouette(0, 0), original.masks[0])
 
 
@@ -654,9 +640,9 @@ def test_train_and_test_are_one_data_set(release, original):
     ],
 )
 def test_image_paths_of_other_shapes(tmp_path, original, path, name, mask):
-    frame = dataclasses.replace(annot_frames(OWN, original.cameras, original.poses)[0], img_path=path)
-    ocmotion.write_annot(tmp_path / "annot" / "test.pkl", [[[frame]]])
-    ocmotion.write_frame(tmp_path, path.replace("\\", "/"), original.images[0], original.masks[0])
+    write_annots(tmp_path, [[[annot_frame(path, original.cameras[OWN], {"0": original.poses[0]})]]], "test")
+    for at, picture in ((path.replace("\\", "/"), original.images[0]), (mask, original.masks[0] * np.uint8(255))):
+        write_picture(tmp_path / at, picture)
     dataset = OcMotionOriginal(tmp_path)
     assert dataset.subjects() == [name]
     capture = dataset.open(name)
@@ -731,9 +717,9 @@ MOVED[2, 3] = 4.5
         (set_frame(1, img_path=path_of(OWN, 0)), "images/0011/02/00001.jpg is listed 2 times"),
         (set_frame(1, img_path=5), "frame 1: expected the image's path in 'img_path', found a int"),
         (set_frame(1, h_w=(5, 5)), r"frame 1: h_w is \(5, 5\), \(96, 128\) at the first"),
-        (set_frame(1, h_w="wide"), r"expected \(height, width\) px in 'h_w'"),
-        (set_frame(1, h_w=(0, 5)), r"expected \(height, width\) px in 'h_w'"),
-        (lambda content: content[0][1][1].update({"0": 7}), "expected a dictionary for person 0, found a int"),
+        (set_frame(1, h_w="wide"), r"expected 'h_w' to be numbers"),
+        (set_frame(1, h_w=(0, 5)), r"h_w is \(0, 5\)"),
+        (lambda content: content[0][1][1].update({"0": 7}), "expected 'intri'.*no such key"),
     ],
 )
 def test_bad_annotations_of_one_subject(release, damage, expected):
