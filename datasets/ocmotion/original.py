@@ -27,10 +27,10 @@ from numpy.typing import NDArray
 
 from ihbench.body import Body
 from ihbench.body.pose import BodyPose
-from ihbench.camera import Camera, off_orthogonal
+from ihbench.camera import Camera
 from ihbench.datasets.reading.capture_folder import CaptureFolder
 from ihbench.datasets.reading.plausibility import readable
-from ihbench.datasets.reading.stored_numbers import described, numbers
+from ihbench.datasets.reading.stored_numbers import FARTHEST, check_calibration, described, numbers
 from ihbench.datasets.reading.subject_folders import SubjectFolders, View, count_files
 from ihbench.errors import BadInput
 from ihbench.files.paths import user_path
@@ -43,7 +43,6 @@ OneCapture = TypeVar("OneCapture", bound="OneCameraCapture")
 
 SPLITS = ("train", "test")
 SAME_CAMERA = 1e-4  # largest difference between frames, relative to the largest entry of K, R and t
-FARTHEST = 100.0  # m from the origin: the scenes are rooms
 LARGEST_ROTATION = 4 * np.pi  # rad of one joint; a fit may wind once around, degrees go further
 
 
@@ -338,20 +337,6 @@ def one_camera(
             f"expected one fixed camera for all frames"
         )
     return K[0], E[0]
-
-
-def check_calibration(K: Array, E: Array, where: str) -> None:
-    """Raise `BadInput` unless K is a pinhole's and E a rigid world-to-camera transform in metres."""
-    if K[0, 0] <= 0 or K[1, 1] <= 0 or np.abs(K[2] - [0, 0, 1]).max() > 1e-6 or abs(K[1, 0]) > 1e-6:
-        raise BadInput(f"{where}: expected intrinsics [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] px, found another matrix")
-    R = E[:3, :3]
-    if off_orthogonal(R) > 1e-3 or np.linalg.det(R) < 0 or np.abs(E[3] - [0, 0, 0, 1]).max() > 1e-6:
-        raise BadInput(f"{where}: expected extrinsics [[R, t], [0, 1]] with a rotation R, found another matrix")
-    if np.linalg.norm(E[:3, 3]) > FARTHEST:
-        raise BadInput(
-            f"{where}: the camera stands {np.linalg.norm(E[:3, 3]):.4g} from the origin; expected metres, divide the "
-            f"extrinsics' t by 1000 if it is in millimetres"
-        )
 
 
 def three_channels(

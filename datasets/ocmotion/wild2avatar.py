@@ -28,7 +28,6 @@ from ihbench.camera import Camera
 from ihbench.datasets.ocmotion.original import (
     OneCameraCapture,
     Sequences,
-    check_calibration,
     metric_pose,
     one_camera,
     ten_betas,
@@ -36,7 +35,7 @@ from ihbench.datasets.ocmotion.original import (
 )
 from ihbench.datasets.reading.capture_folder import picture_files
 from ihbench.datasets.reading.pickles import write_pickle
-from ihbench.datasets.reading.stored_numbers import described, numbers, stored_camera
+from ihbench.datasets.reading.stored_numbers import check_calibration, described, numbers, stored_camera
 from ihbench.datasets.reading.subject_folders import View
 from ihbench.errors import BadInput
 from ihbench.files import atomic

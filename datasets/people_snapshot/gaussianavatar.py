@@ -26,12 +26,14 @@ from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.datasets.people_snapshot.original import (
     PeopleSnapshotRaw,
+    Poses,
     SnapshotPictures,
     finite_pose,
     read_npz,
     report_spoiled_rows,
-    rigid_extrinsic,
     stacked,
+    stored_pinhole,
+    stored_poses,
 )
 from ihbench.datasets.reading.capture_folder import picture_files
 from ihbench.datasets.reading.stored_numbers import stored_camera
@@ -73,16 +75,10 @@ class GaussianAvatarFolder(SubjectFolders["GaussianAvatarCapture"]):
             if not count:
                 report.problem(f"no image in {split}/{IMAGES}")
                 continue
-            path = capture.folder / split / POSES
             try:
-                pose, trans, beta = capture._poses(split)
+                report_spoiled_rows(report, capture.folder / split / POSES, *capture._poses(split)[:2])
             except BadInput as error:
                 report.problem(str(error))
-                continue
-            if not np.isfinite(beta).all():
-                report.problem(f"{path}: NaN or infinity in 'beta'")
-            else:
-                report_spoiled_rows(report, path, pose, trans)
         return [(0, frame) for frame in sorted(there["mask"])]
 
 
@@ -118,7 +114,7 @@ class GaussianAvatarCapture(SnapshotPictures):
         self.numbered = len(set(numbers)) == len(stored) and max(numbers) <= LARGEST_FRAME
         self._stored = dict(zip(numbers if self.numbered else range(len(stored)), stored, strict=True))
         self.n_frames = max(self._stored) + 1
-        self._rows: dict[str, tuple[NDArray, NDArray, NDArray]] = {}
+        self._rows: dict[str, Poses] = {}
 
     @property
     def frames(self) -> list[int]:
@@ -141,18 +137,14 @@ class GaussianAvatarCapture(SnapshotPictures):
     def _camera(self) -> Camera:
         first: tuple[Path, NDArray, NDArray] | None = None
         for path in dict.fromkeys(self.camera_path(frame) for frame in self.frames):
-            stored = read_npz(path, {"intrinsic": (3, 3), "extrinsic": None})
-            K, (R, t) = stored["intrinsic"].astype(np.float64), rigid_extrinsic(stored["extrinsic"], path)
-            E = np.column_stack([R, t])
-            if not np.isfinite(K).all():
-                raise BadInput(f"{path}: NaN or infinity in 'intrinsic'; expected finite numbers")
+            K, E = stored_pinhole(read_npz(path, "intrinsic and extrinsic"), path)
             if first is None:
                 first = path, K, E
             elif not (np.allclose(K, first[1], rtol=1e-6) and np.allclose(E, first[2], atol=1e-6)):
                 raise BadInput(f"{path}: another camera than {first[0]}; expected one fixed camera for all images")
         assert first is not None
         width, height = size_of(self._stored[self.frames[0]].image)
-        return Camera.from_opencv(first[1], first[2][:, :3], first[2][:, 3], width, height)
+        return Camera.from_opencv(first[1], first[2][:3, :3], first[2][:3, 3], width, height)
 
     def body_pose(self, frame: int) -> BodyPose:
         """The frame's SMPL parameters, standard root convention."""
@@ -186,7 +178,7 @@ class GaussianAvatarCapture(SnapshotPictures):
             )
         return self._stored[frame]
 
-    def _poses(self, split: str) -> tuple[NDArray, NDArray, NDArray]:
+    def _poses(self, split: str) -> Poses:
         if split not in self._rows:
             path = self.folder / split / POSES
             rows = read_poses(path)
@@ -205,32 +197,19 @@ def _holds_split(folder: Path) -> bool:
     return sum((*parts, (folder / IMAGES).is_dir())) >= 2
 
 
-def read_poses(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def read_poses(path: Path) -> Poses:
     """(body_pose [N, 72] rad, trans [N, 3] m, beta [10]) of smpl_parms.pth. Raises `BadInput`; runs nothing in it."""
-    import torch
-
     if not path.is_file():
         raise missing_file(path, "expected beta, body_pose and trans of the split's images")
-    content = read_tensors(path)
-    sizes = {"body_pose": 72, "trans": 3, "beta": 10}
-    if not sizes.keys() <= content.keys():
-        raise BadInput(f"{path}: expected a dictionary with beta, body_pose and trans, found {sorted(content)[:9]}")
-    values = []
-    for key, size in sizes.items():
-        value = content[key]
-        expected_shape = "[1, 10]" if key == "beta" else f"[N, {size}]"
-        real = isinstance(value, torch.Tensor) and not (value.is_complex() or value.is_sparse or value.is_quantized)
-        if not real or value.layout != torch.strided or value.device.type != "cpu":
-            raise BadInput(f"{path}: expected a tensor {expected_shape} in {key!r}, found a {type(value).__name__}")
-        value = value.detach().to(torch.float64).numpy()
-        value = value.reshape(-1) if key == "beta" else value
-        if value.shape[-1:] != (size,) or value.ndim != (1 if key == "beta" else 2):
-            raise BadInput(f"{path}: expected shape {expected_shape} in {key!r}, found {list(content[key].shape)}")
-        values.append(value)
-    pose, trans, beta = values
-    if len(pose) != len(trans):
-        raise BadInput(f"{path}: expected one 'trans' for each 'body_pose', found {len(trans)} and {len(pose)}")
-    return pose, trans, beta
+    content = {}
+    for key, value in read_tensors(path).items():
+        try:
+            content[key] = value.detach().double().numpy()
+        except (AttributeError, RuntimeError, TypeError):  # no tensor, or a sparse or quantised one
+            raise BadInput(
+                f"{path}: expected a tensor of numbers in {key!r}, found a {type(value).__name__}"
+            ) from None
+    return stored_poses(content, path, "body_pose", "trans", "beta")
 
 
 # ----------------------------------------------------------------------------------------------- write
@@ -239,7 +218,7 @@ def read_poses(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], ND
 def write_camera(folder: Path, split: str, camera: Camera) -> None:
     """The split's cam_parms.npz. Lossless, but for distortion, which this layout lacks: `ValueError`."""
     K, E = stored_camera(camera, "GaussianAvatar")
-    write_npz(_split(folder, split) / f"{CAMERA}.npz", {"intrinsic": K, "extrinsic": E}, durable=False)
+    write_npz(folder / split / f"{CAMERA}.npz", {"intrinsic": K, "extrinsic": E}, durable=False)
 
 
 def write_frame(
@@ -252,7 +231,7 @@ def write_frame(
     """The frame's image and mask as PNG. Lossless."""
     label = np.where(mask != 0, 255, 0).astype(np.uint8)
     for kind, picture in ((IMAGES, image), (MASKS, label)):
-        write_picture(_split(folder, split) / kind / f"{frame:06d}.png", picture)
+        write_picture(folder / split / kind / f"{frame:06d}.png", picture)
 
 
 def write_poses(folder: Path, split: str, poses: Sequence[BodyPose]) -> None:
@@ -265,10 +244,4 @@ def write_poses(folder: Path, split: str, poses: Sequence[BodyPose]) -> None:
     pose, trans, betas = (torch.from_numpy(value) for value in stacked(poses))
     buffer = io.BytesIO()
     torch.save({"beta": betas[None].clone(), "body_pose": pose, "trans": trans}, buffer)
-    atomic.write_bytes(_split(folder, split) / POSES, buffer.getvalue(), durable=False)
-
-
-def _split(folder: Path, split: str) -> Path:
-    if split not in SPLITS:
-        raise ValueError(f"split: expected one of {SPLITS}, got {split!r}")
-    return folder / split
+    atomic.write_bytes(folder / split / POSES, buffer.getvalue(), durable=False)

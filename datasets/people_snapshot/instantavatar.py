@@ -8,7 +8,7 @@
 
 Source: tijiang13/InstantAvatar scripts/peoplesnapshot/ and instant_avatar/datasets/peoplesnapshot.py. Anim-NeRF's
 files replace the poses of their frames. They do not say which frames these are; for the four subjects that
-InstantAvatar uses the subject's name tells. Files written here say it, in `frames`.
+InstantAvatar uses the subject's name tells; they may say it in `frames`.
 """
 
 from __future__ import annotations
@@ -27,19 +27,22 @@ from ihbench.camera import Camera
 from ihbench.datasets.people_snapshot.gaussianavatar import GaussianAvatarFolder
 from ihbench.datasets.people_snapshot.original import (
     PeopleSnapshotRaw,
+    Poses,
     SnapshotPictures,
     finite_pose,
     read_npz,
     report_spoiled_rows,
-    rigid_extrinsic,
+    soft_mask,
     stacked,
+    stored_pinhole,
+    stored_poses,
 )
-from ihbench.datasets.reading.stored_numbers import stored_camera
+from ihbench.datasets.reading.stored_numbers import described, numbers, stored_camera
 from ihbench.datasets.reading.subject_folders import SubjectFolders, View, count_files
 from ihbench.errors import BadInput
 from ihbench.files import atomic
 from ihbench.files.npz import write_npz
-from ihbench.files.pictures import above_half, write_picture
+from ihbench.files.pictures import write_picture
 from ihbench.files.safe_pickle import load_npy
 from ihbench.scene.copy_report import SubjectReport
 
@@ -78,15 +81,15 @@ class InstantAvatarFolder(SubjectFolders["InstantAvatarCapture"]):
         paths = {"image": capture.image_path, "mask": capture.mask_path}
         frames = range(capture.n_frames)
         there = count_files(report, {kind: {f: path_of(f) for f in frames} for kind, path_of in paths.items()})
-        refined = {f"anim_nerf_{split}": len(rows[0]) for split, rows in capture.refined.items()}
+        refined = {f"anim_nerf_{split}": len(frames) for split, (frames, _) in capture.refined.items()}
         report.files |= {"poses": n_poses, **refined}
         if surplus := sum(frame >= n_poses for frame in capture.images):
             report.warn(f"{surplus} images have no pose in {POSES_FILE} and are not used")
         if not capture.standin and (surplus := n_poses - capture.n_frames) > 0:
             report.warn(f"{surplus} poses after the last image are not used")
         report_spoiled_rows(report, capture.folder / POSES_FILE, *capture._poses[:2])
-        for split, rows in capture.refined.items():
-            report_spoiled_rows(report, capture.folder / REFINED[split], *rows[1:3])
+        for split, (_, poses) in capture.refined.items():
+            report_spoiled_rows(report, capture.folder / REFINED[split], *poses[:2])
         return [(0, frame) for frame in sorted(there["image"] & there["mask"])]
 
 
@@ -112,7 +115,7 @@ class InstantAvatarCapture(SnapshotPictures):
             if (folder / name).is_file()
         }
         self._row_of: dict[int, tuple[str, int]] = {}
-        for split, (frames, *_) in self.refined.items():
+        for split, (frames, _) in self.refined.items():
             for row, frame in enumerate(frames):
                 if frame in self._row_of:
                     other = self._row_of[frame][0]
@@ -134,7 +137,7 @@ class InstantAvatarCapture(SnapshotPictures):
         if frame not in self._row_of:
             return finite_pose(self.folder / POSES_FILE, frame, *self._poses)
         split, row = self._row_of[frame]
-        return finite_pose(self.folder / REFINED[split], row, *self.refined[split][1:])
+        return finite_pose(self.folder / REFINED[split], row, *self.refined[split][1])
 
     def image_path(self, frame: int) -> Path:
         return self.folder / "images" / f"image_{frame:04d}.png"
@@ -144,7 +147,11 @@ class InstantAvatarCapture(SnapshotPictures):
 
     @staticmethod
     def read_mask(path: Path) -> NDArray[np.bool_]:
-        return read_mask(path)
+        mask = load_npy(path)
+        mask = mask[..., 0] if mask.ndim == 3 and mask.shape[2] == 1 else mask
+        if mask.ndim != 2 or not mask.size or mask.dtype.kind not in "biuf":
+            raise BadInput(f"{path}: expected numbers of shape [H, W], found {described(mask)}")
+        return soft_mask(mask, path)
 
 
 def _numbered_images(folder: Path) -> list[int]:
@@ -156,62 +163,42 @@ def _numbered_images(folder: Path) -> list[int]:
 
 def read_camera(path: Path) -> Camera:
     """The camera of cameras.npz. Raises `BadInput` naming the entry that is not as expected."""
-    stored = read_npz(path, {"intrinsic": (3, 3), "extrinsic": None, "height": None, "width": None})
-    K = stored["intrinsic"].astype(np.float64)
-    if not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
-        raise BadInput(f"{path}: expected finite numbers and positive focal lengths in 'intrinsic', found others")
-    sizes = []
-    for key in ("width", "height"):
-        value = stored[key].reshape(-1)
-        if value.size != 1 or not float(value[0]).is_integer() or not 1 <= value[0] <= 65535:
-            raise BadInput(f"{path}: expected one whole number of pixels in {key!r}, found {value.tolist()}")
-        sizes.append(int(value[0]))
-    return Camera.from_opencv(K, *rigid_extrinsic(stored["extrinsic"], path), *sizes)
+    stored = read_npz(path, "intrinsic, extrinsic, height and width")
+    K, E = stored_pinhole(stored, path)
+    width, height = (float(numbers(stored, key, (1,), path)[0]) for key in ("width", "height"))
+    if not (width.is_integer() and height.is_integer() and 1 <= width <= 65535 and 1 <= height <= 65535):
+        raise BadInput(f"{path}: expected width and height in whole pixels, found {width:g} and {height:g}")
+    return Camera.from_opencv(K, E[:3, :3], E[:3, 3], int(width), int(height))
 
 
-def read_poses(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def read_poses(path: Path) -> Poses:
     """(thetas [N, 72] rad, transl [N, 3] m, betas [10]); poses may hold NaN. Raises `BadInput` for other shapes.
 
     Accepts `global_orient` [N, 3] and `body_pose` [N, 69] in place of thetas, as InstantAvatar does.
     """
-    shapes: dict[str, tuple[int | None, ...] | None] = {
-        "betas": None,
-        "transl": (None, 3),
-        "thetas?": (None, 72),
-        "global_orient?": (None, 3),
-        "body_pose?": (None, 69),
-    }
-    stored = read_npz(path, shapes)
-    if "thetas" in stored:
-        thetas = stored["thetas"]
-    elif {"global_orient", "body_pose"} <= stored.keys():
-        if len(stored["global_orient"]) != len(stored["body_pose"]):
+    stored = read_npz(path, "betas, thetas and transl")
+    if "thetas" not in stored and {"global_orient", "body_pose"} <= stored.keys():
+        root, others = (
+            numbers(stored, *part, path, False) for part in (("global_orient", (-1, 3)), ("body_pose", (-1, 69)))
+        )
+        if len(root) != len(others):
             raise BadInput(f"{path}: expected as many global_orient as body_pose, found others")
-        thetas = np.concatenate([stored["global_orient"], stored["body_pose"]], 1)
-    else:
-        raise BadInput(f"{path}: expected 'thetas' in it, found {', '.join(sorted(stored))}")
-    betas, transl = stored["betas"].reshape(-1), stored["transl"]
-    if betas.size != 10 or not np.isfinite(betas).all():
-        raise BadInput(f"{path}: expected 10 finite numbers in 'betas', found {list(stored['betas'].shape)} or NaN")
-    if len(thetas) != len(transl) or not len(thetas):
-        raise BadInput(f"{path}: expected one 'transl' for each pose, found {len(transl)} and {len(thetas)}")
-    return thetas.astype(np.float64), transl.astype(np.float64), betas.astype(np.float64)
+        stored["thetas"] = np.concatenate([root, others], 1)
+    return stored_poses(stored, path, "thetas", "transl", "betas")
 
 
-def read_refined(
-    path: Path, split: str, subject: str, n_frames: int
-) -> tuple[list[int], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """(frames, thetas [n, 72], transl [n, 3], betas [10]) of one of Anim-NeRF's files.
+def read_refined(path: Path, split: str, subject: str, n_frames: int) -> tuple[list[int], Poses]:
+    """The frames of one of Anim-NeRF's files, and their poses.
 
     Raises `BadInput` when the file does not say its frames and the subject's official split has another count.
     """
     poses = read_poses(path)
     count = len(poses[0])
-    stored = read_npz(path, {"frames?": (None,)}).get("frames")
+    stored = read_npz(path, "frames").get("frames")
     if stored is not None:
-        frames = [int(frame) for frame in stored]
-        if stored.dtype.kind not in "iu" or len(frames) != count or len(set(frames)) != count:
+        if stored.dtype.kind not in "iu" or stored.shape != (count,) or len(np.unique(stored)) != count:
             raise BadInput(f"{path}: expected {count} different frame numbers in 'frames', found others")
+        frames = stored.tolist()
     else:
         official = OFFICIAL_FRAMES.get(subject, {}).get(split)
         if official is None or len(official) != count:
@@ -226,23 +213,7 @@ def read_refined(
             f"{path}: refines frames {min(frames)} to {max(frames)}, but {POSES_FILE} has {n_frames} poses; "
             f"expected frames of this subject"
         )
-    return frames, *poses
-
-
-def read_mask(path: Path) -> NDArray[np.bool_]:
-    """[H, W], True where a mask of 0 to 1 or of 0 to 255 is above one half. Raises `BadInput`."""
-    mask = load_npy(path)
-    if mask.ndim == 3 and mask.shape[2] == 1:
-        mask = mask[..., 0]
-    if mask.ndim != 2 or mask.dtype.kind not in "biuf":
-        raise BadInput(f"{path}: expected numbers of shape [H, W], found {mask.dtype} of shape {list(mask.shape)}")
-    if mask.dtype == bool:
-        return mask
-    lowest, highest = (float(mask.min()), float(mask.max())) if mask.size else (0.0, 0.0)
-    if not (np.isfinite([lowest, highest]).all() and lowest >= -0.01 and highest <= 255):
-        raise BadInput(f"{path}: expected 0 to 1, or 0 to 255, found {lowest:g} to {highest:g}")
-    # a soft mask of 0 to 1 may overshoot a little where it was resampled
-    return above_half(mask, 1 if highest <= 1.5 else 255)
+    return frames, poses
 
 
 # ----------------------------------------------------------------------------------------------- write
@@ -257,19 +228,8 @@ def write_camera(folder: Path, camera: Camera) -> None:
 
 def write_poses(folder: Path, poses: Sequence[BodyPose]) -> None:
     """poses.npz, float32 (1e-6 rad and m): a pose for each frame from 0. `ValueError` when the betas differ."""
-    write_npz(folder / POSES_FILE, _named(poses), durable=False)
-
-
-def write_refined(folder: Path, split: str, frames: Sequence[int], poses: Sequence[BodyPose]) -> None:
-    """poses/anim_nerf_<split>.npz with the frames it refines, float32. `split` is "train" or "test"."""
-    if len(frames) != len(poses):
-        raise ValueError(f"refined poses: expected one for each of {len(frames)} frames, got {len(poses)}")
-    write_npz(folder / REFINED[split], {**_named(poses), "frames": np.asarray(frames, np.int64)}, durable=False)
-
-
-def _named(poses: Sequence[BodyPose]) -> dict[str, NDArray]:
     thetas, transl, betas = stacked(poses)
-    return {"betas": betas, "thetas": thetas, "transl": transl}
+    write_npz(folder / POSES_FILE, {"betas": betas, "thetas": thetas, "transl": transl}, durable=False)
 
 
 def write_frame(

@@ -20,10 +20,9 @@ import re
 import tempfile
 import threading
 from abc import abstractmethod
-from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from functools import cached_property
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from functools import cached_property, lru_cache
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,11 +33,11 @@ from numpy.typing import NDArray
 from ihbench.body import Body
 from ihbench.body.pose import BodyPose
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
-from ihbench.camera import Camera, off_orthogonal
+from ihbench.camera import Camera
 from ihbench.datasets.reading.capture_folder import BY_OPTIONS, CaptureFolder
 from ihbench.datasets.reading.pickles import write_pickle
 from ihbench.datasets.reading.plausibility import share_inside, some
-from ihbench.datasets.reading.stored_numbers import numbers
+from ihbench.datasets.reading.stored_numbers import check_calibration, numbers
 from ihbench.datasets.reading.subject_folders import SubjectFolders, View
 from ihbench.errors import BadInput
 from ihbench.files import atomic, npz
@@ -58,6 +57,10 @@ KEPT_PICTURES = 4
 CHUNK_CACHE = 64 << 20  # bytes; the released masks are stored in chunks of many frames
 COMPARED_FRAMES = 5
 CLEARLY_BETTER = 0.002  # share of vertices by which the last poses must beat the first
+
+Poses = tuple[
+    NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]
+]  # pose [N, 72] rad, trans [N, 3] m, betas [10]
 
 
 class PeopleSnapshotRaw(SubjectFolders["PeopleSnapshotCapture"]):
@@ -164,7 +167,6 @@ class PeopleSnapshotCapture(SnapshotFolder):
                 )
         self.n_masks, self.n_poses = self._masks.shape[0], len(self._poses[0])
         self.n_frames = min(self.video.n_frames, self.n_masks, self.n_poses)
-        self._file_digests: dict[Path, tuple[tuple[int, int], bytes]] = {}
 
     @property
     def variant(self) -> str:
@@ -234,20 +236,16 @@ class PeopleSnapshotCapture(SnapshotFolder):
         self.check_index(camera, frame)
         digest = hashlib.sha256(f"{source} {frame}".encode())
         for path in (self.video.path, self._masks.path):
-            digest.update(self._file_digest(path))
+            with suppress(OSError):
+                state = path.stat()
+                digest.update(_file_digest(path, state.st_size, state.st_mtime_ns))
         return digest.digest()
 
-    def _file_digest(self, path: Path) -> bytes:
-        try:
-            state = path.stat()
-            stamp = state.st_size, state.st_mtime_ns
-            known = self._file_digests.get(path)
-            if known is None or known[0] != stamp:
-                with path.open("rb") as file:
-                    known = self._file_digests[path] = stamp, hashlib.file_digest(file, "sha256").digest()
-            return known[1]
-        except OSError:
-            return b""
+
+@lru_cache(maxsize=64)
+def _file_digest(path: Path, _size: int, _mtime: int) -> bytes:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").digest()
 
 
 def video_path(folder: Path) -> Path:
@@ -297,23 +295,24 @@ def read_camera(path: Path) -> Camera:
     return Camera.from_opencv(K, R, values["camera_t"], int(width), int(height), values["camera_k"])
 
 
-def read_poses(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """(pose [M, 72] rad, trans [M, 3] m, betas [10]); poses may hold NaN. Raises `BadInput` for other shapes."""
+def read_poses(path: Path) -> Poses:
+    """The poses of the release; they may hold NaN. Raises `BadInput` for other shapes."""
+    names = ("pose", "trans", "betas")
     with _hdf5(path) as file:
-        pose, trans = (_read_dataset(file, name, (None, n), path) for name, n in (("pose", 72), ("trans", 3)))
-        betas = _read_dataset(file, "betas", None, path).reshape(-1)
-    if len(pose) != len(trans) or not len(pose):
-        raise BadInput(f"{path}: expected one 'trans' for each 'pose', found {len(pose)} poses, {len(trans)} trans")
-    if betas.size != 10:
-        raise BadInput(f"{path}: expected 10 numbers in 'betas', found {betas.size}")
-    if not np.isfinite(betas).all():
-        raise BadInput(f"{path}: NaN or infinity in 'betas'; expected finite numbers, copy the file again")
-    return pose, trans, betas
+        return stored_poses({name: _dataset(file, name, path)[()] for name in names}, path, *names)
+
+
+def stored_poses(content: Mapping[str, Any], path: Path, pose: str, trans: str, betas: str) -> Poses:
+    """(pose [N, 72] rad, trans [N, 3] m, betas [10]) under these names; poses may hold NaN. Raises `BadInput`."""
+    poses, places = numbers(content, pose, (-1, 72), path, False), numbers(content, trans, (-1, 3), path, False)
+    if len(poses) != len(places):
+        raise BadInput(f"{path}: expected one {trans!r} for each {pose!r}, found {len(places)} and {len(poses)}")
+    return poses, places, numbers(content, betas, (10,), path)
 
 
 def finite_pose(path: Path, index: int, pose: NDArray, trans: NDArray, betas: NDArray) -> BodyPose:
     """Row `index` of pose [M, 72] and trans [M, 3]. Raises `BadInput` when it holds NaN or infinity."""
-    for name, value in (("pose", pose[index]), ("trans", trans[index]), ("betas", betas)):
+    for name, value in (("pose", pose[index]), ("trans", trans[index])):
         if not np.isfinite(value).all():
             raise BadInput(f"{path}: NaN or infinity in the {name} of row {index}; leave this frame out {BY_OPTIONS}")
     return BodyPose(pose[index].reshape(24, 3), betas, trans[index])
@@ -328,96 +327,69 @@ def read_consensus(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]
 def read_keypoints(path: Path) -> NDArray[np.float64]:
     """[N, 18, 3]: x px, y px (OpenCV's integer pixel centres), confidence. Raises `BadInput`."""
     with _hdf5(path) as file:
-        return _read_dataset(file, "keypoints", (None, 3 * N_KEYPOINTS), path).reshape(-1, N_KEYPOINTS, 3)
+        content = {"keypoints": _dataset(file, "keypoints", path)[()]}
+        return numbers(content, "keypoints", (-1, 3 * N_KEYPOINTS), path, False).reshape(-1, N_KEYPOINTS, 3)
 
 
-def read_npz(path: Path, shapes: dict[str, tuple[int | None, ...] | None]) -> dict[str, NDArray]:
-    """Arrays of numbers from an .npz file by name; a shape's None stands for any length, a shape None for any shape.
-
-    A name that ends in "?" may be missing. Raises `BadInput` for a damaged file, a missing name or another shape.
-    """
+def read_npz(path: Path, expected: str) -> dict[str, NDArray]:
+    """The arrays by name. Raises `BadInput` for a missing or damaged file."""
     if not path.is_file():
-        raise missing_file(path, f"expected {', '.join(name.rstrip('?') for name in shapes)} in it")
-    arrays = npz.read_npz(path)
-    for name in shapes:
-        if name.rstrip("?") not in arrays and not name.endswith("?"):
-            raise BadInput(f"{path}: expected {name!r} in it, found {', '.join(sorted(arrays)) or 'nothing'}")
-    for name, shape in shapes.items():
-        array = arrays.get(name.rstrip("?"))
-        if array is not None:
-            _check_array(array.dtype, array.shape, shape, f"{path}: expected {name.rstrip('?')!r}")
-    return {key: arrays[key] for key in (name.rstrip("?") for name in shapes) if key in arrays}
+        raise missing_file(path, f"expected {expected} in it")
+    return npz.read_npz(path)
 
 
-def rigid_extrinsic(extrinsic: NDArray, path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(R [3, 3], t [3] m) of a world-to-camera matrix [4, 4] or [3, 4]. Raises `BadInput` when it is not rigid."""
-    if extrinsic.shape not in ((4, 4), (3, 4)):
-        raise BadInput(f"{path}: expected 'extrinsic' of shape [4, 4], found {list(extrinsic.shape)}")
-    extrinsic = extrinsic.astype(np.float64)
-    if not np.isfinite(extrinsic).all():
-        raise BadInput(f"{path}: NaN or infinity in 'extrinsic'; expected finite numbers, copy the file again")
-    R = extrinsic[:3, :3]
-    if off_orthogonal(R) > 1e-3 or np.linalg.det(R) < 0:
-        raise BadInput(f"{path}: expected a rotation (right-handed, no scale) in 'extrinsic', found another matrix")
-    return R, extrinsic[:3, 3]
+def stored_pinhole(stored: Mapping[str, Any], path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """K [3, 3] px and E [4, 4] world to camera of a cameras.npz, whose extrinsic may lack its last row. Raises
+    `BadInput`."""
+    K = numbers(stored, "intrinsic", (3, 3), path)
+    short = np.shape(stored.get("extrinsic", ())) == (3, 4)
+    E = numbers(stored, "extrinsic", (3, 4) if short else (4, 4), path)
+    E = np.concatenate([E[:3], [[0, 0, 0, 1]]]) if short else E
+    check_calibration(K, E, path)
+    return K, E
 
 
-def _check_array(
-    dtype: np.dtype, shape: tuple[int, ...], expected: tuple[int | None, ...] | None, start: str
-) -> None:
-    if dtype.kind not in "biuf":
-        raise BadInput(f"{start} to hold numbers, found {dtype}")
-    fits = expected is None or (
-        len(shape) == len(expected) and all(b in (None, a) for a, b in zip(shape, expected, strict=True))
-    )
-    if not fits:
-        assert expected is not None
-        spelled = ", ".join("N" if n is None else str(n) for n in expected)
-        raise BadInput(f"{start} of shape [{spelled}], found {list(shape)}")
+def soft_mask(values: NDArray, where: object) -> NDArray[np.bool_]:
+    """Where a mask [H, W] of 0 to 1 or of 0 to 255 is above one half. Raises `BadInput` for other numbers."""
+    lowest, highest = float(values.min()), float(values.max())
+    if not (np.isfinite([lowest, highest]).all() and lowest >= -0.01 and highest <= 255):
+        raise BadInput(f"{where}: expected 0 to 1, or 0 to 255, found {lowest:g} to {highest:g}")
+    # a soft mask of 0 to 1 may overshoot a little where it was resampled
+    return above_half(values, 1 if highest <= 1.5 else 255)
 
 
-def _hdf5(path: Path) -> h5py.File:
-    try:
-        import h5py
-    except ImportError:
-        raise BadInput(f"{path}: reading HDF5 files needs the package h5py; run: pip install h5py") from None
-    if not path.is_file():
-        raise missing_file(path, "expected an HDF5 file of the PeopleSnapshot release")
-    try:
-        return h5py.File(path, "r", locking=False, rdcc_nbytes=CHUNK_CACHE)  # locks fail on read-only network disks
-    except (OSError, RuntimeError, ValueError) as error:
-        raise BadInput(f"{path}: cut short, or not an HDF5 file ({one_line(error)}); copy the file again") from error
+@contextmanager
+def _hdf5(path: Path) -> Iterator[h5py.File]:
+    with _damage_named(path), _opened_hdf5(path) as file:
+        yield file
 
 
-def _dataset(file: h5py.File, name: str, shape: tuple[int | None, ...] | None, path: Path) -> h5py.Dataset:
+def _opened_hdf5(path: Path) -> h5py.File:
     import h5py
 
-    try:
-        if not isinstance(file.get(name, getlink=True), h5py.HardLink):  # a link may lead into other files
-            names = ", ".join(sorted(file)) or "nothing"
-            raise BadInput(f"{path}: expected a data set {name!r} in it, found {names}; copy the file again")
-        dataset = file[name]
-        if not isinstance(dataset, h5py.Dataset) or dataset.is_virtual or dataset.external:
-            raise BadInput(f"{path}: expected {name!r} to be a data set of its own, found something else")
-        _check_array(dataset.dtype, dataset.shape or (), shape, f"{path}: expected {name!r}")
-    except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
-        raise _damaged(path, error) from error
-    return dataset
+    if not path.is_file():
+        raise missing_file(path, "expected an HDF5 file of the PeopleSnapshot release")
+    return h5py.File(path, "r", locking=False, rdcc_nbytes=CHUNK_CACHE)  # locks fail on read-only network disks
 
 
-def _read_dataset(
-    file: h5py.File, name: str, shape: tuple[int | None, ...] | None, path: Path
-) -> NDArray[np.float64]:
-    dataset = _dataset(file, name, shape, path)
+@contextmanager
+def _damage_named(what: object) -> Iterator[None]:
+    """What h5py raises of damaged files becomes `BadInput`."""
     try:
         with np.errstate(invalid="ignore"):  # NaN of other kinds; whoever asks looks for NaN
-            return np.asarray(dataset[()], np.float64)
-    except (OSError, RuntimeError, ValueError, MemoryError) as error:
-        raise _damaged(path, error) from error
+            yield
+    except (OSError, RuntimeError, ValueError, KeyError, TypeError, MemoryError) as error:
+        raise BadInput(f"{what} is damaged or cut short ({one_line(error)}); copy the file again") from error
 
 
-def _damaged(path: Path, error: Exception) -> BadInput:
-    return BadInput(f"{path}: damaged ({one_line(error)}); copy the file again")
+def _dataset(file: h5py.File, name: str, path: Path) -> h5py.Dataset:
+    import h5py
+
+    dataset = file.get(name)
+    if not isinstance(dataset, h5py.Dataset):
+        names = ", ".join(sorted(file)) or "nothing"
+        raise BadInput(f"{path}: expected a data set {name!r} in it, found {names}; copy the file again")
+    return dataset
 
 
 class MaskFile:
@@ -429,29 +401,21 @@ class MaskFile:
         self._lock = threading.Lock()
         self._file: h5py.File | None = None
         with _hdf5(path) as file:
-            self.shape: tuple[int, int, int] = tuple(_dataset(file, "masks", (None, None, None), path).shape)
-        if 0 in self.shape:
-            raise BadInput(f"{path}: expected 'masks' of shape [N, H, W], found none ({list(self.shape)})")
+            masks = _dataset(file, "masks", path)
+            self.shape: tuple[int, int, int] = masks.shape
+            if masks.dtype.kind not in "biuf" or len(self.shape) != 3 or 0 in self.shape:
+                found = f"{masks.dtype} {list(self.shape)}"
+                raise BadInput(f"{path}: expected 'masks' to be numbers of shape [N, H, W], found {found}")
 
     def __reduce__(self) -> tuple:
         return type(self), (self.path,)  # a handle stays with its process
 
     def frame(self, number: int) -> NDArray[np.bool_]:
         """[H, W], True = person. Raises `BadInput` when the frame's data are damaged."""
-        with self._lock:
-            if self._file is None:
-                self._file = _hdf5(self.path)
-            try:
-                mask = np.asarray(_dataset(self._file, "masks", (None, *self.shape[1:]), self.path)[number])
-            except (OSError, RuntimeError, ValueError, MemoryError) as error:
-                raise BadInput(
-                    f"{self.path}: mask {number} is damaged ({one_line(error)}); copy the file again"
-                ) from error
-        if mask.dtype.kind != "f":
-            return mask != 0
-        if not (np.isfinite(mask).all() and mask.min() >= 0 and mask.max() <= 255):
-            raise BadInput(f"{self.path}: mask {number}: expected 0 to 1, or 0 to 255, found other numbers or NaN")
-        return above_half(mask, 1 if mask.max() <= 1 else 255)
+        with self._lock, _damage_named(f"{self.path}: mask {number}"):
+            self._file = self._file or _opened_hdf5(self.path)
+            mask = np.asarray(_dataset(self._file, "masks", self.path)[number])
+        return soft_mask(mask, f"{self.path}: mask {number}") if mask.dtype.kind == "f" else mask != 0
 
 
 class Video:
@@ -465,7 +429,7 @@ class Video:
         """Reads the header. Raises `BadInput` when it is missing, damaged, or names no frames."""
         self.path = path
         self._lock = threading.Lock()
-        self._kept: OrderedDict[int, NDArray[np.uint8]] = OrderedDict()
+        self._decoded = lru_cache(maxsize=KEPT_PICTURES)(self._decode)
         self._next = 0  # the frame that the stream decodes next
         self._stream = self._opened()
         import cv2
@@ -473,7 +437,6 @@ class Video:
         self.n_frames = int(self._stream.get(cv2.CAP_PROP_FRAME_COUNT))  # by the header
         width, height = (int(self._stream.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         self.size = (height, width)  # px
-        self.fps = float(self._stream.get(cv2.CAP_PROP_FPS))
         if self.n_frames < 1:
             raise BadInput(f"{path}: its header names no frames; expected a complete video, copy the file again")
 
@@ -482,24 +445,20 @@ class Video:
 
     def frame(self, number: int) -> NDArray[np.uint8]:
         """[H, W, 3] RGB. Raises `BadInput` when the video ends before this frame."""
+        with self._lock:
+            return self._decoded(number).copy()
+
+    def _decode(self, number: int) -> NDArray[np.uint8]:
         import cv2
 
-        with self._lock:
-            if number in self._kept:
-                self._kept.move_to_end(number)
-                return self._kept[number].copy()
-            if number < self._next:
-                self._stream.release()
-                self._stream, self._next = self._opened(), 0
-            while self._next < number:
-                self._step(self._stream.grab(), number)
-            ok, picture = self._stream.read()
-            self._step(ok, number)
-            image = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
-            self._kept[number] = image
-            while len(self._kept) > KEPT_PICTURES:
-                self._kept.popitem(last=False)
-            return image.copy()
+        if number < self._next:
+            self._stream.release()
+            self._stream, self._next = self._opened(), 0
+        while self._next < number:
+            self._step(self._stream.grab(), number)
+        ok, picture = self._stream.read()
+        self._step(ok, number)
+        return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), np.uint8)
 
     def _step(self, decoded: bool, number: int) -> None:
         if decoded:
@@ -516,12 +475,8 @@ class Video:
 
         if not self.path.is_file():
             raise missing_file(self.path, "expected the subject's video")
-        try:
-            stream = cv2.VideoCapture(str(self.path.absolute()), cv2.CAP_FFMPEG)
-            opened = stream.isOpened()
-        except cv2.error as error:
-            raise BadInput(f"{self.path}: not a readable video ({one_line(error)}); copy the file again") from error
-        if not opened:
+        stream = cv2.VideoCapture(str(self.path.absolute()), cv2.CAP_FFMPEG)
+        if not stream.isOpened():
             raise BadInput(f"{self.path}: cut short, or not a video that OpenCV reads; copy the file again")
         if turned := int(stream.get(cv2.CAP_PROP_ORIENTATION_META)):
             raise BadInput(
@@ -596,14 +551,6 @@ def write_consensus(folder: Path, betas: NDArray, v_personal: NDArray) -> None:
         folder / CONSENSUS_FILE,
         {"betas": np.asarray(betas, np.float64), "v_personal": np.asarray(v_personal, np.float64)},
     )
-
-
-def write_keypoints(folder: Path, keypoints: NDArray) -> None:
-    """keypoints.hdf5 from [N, 18, 3] (x px, y px, confidence), float32."""
-    if keypoints.ndim != 3 or keypoints.shape[1:] != (N_KEYPOINTS, 3):
-        raise ValueError(f"keypoints: expected shape [N, {N_KEYPOINTS}, 3], got {keypoints.shape}")
-    with _new_hdf5(folder / KEYPOINTS_FILE) as file:
-        file.create_dataset("keypoints", data=keypoints.reshape(len(keypoints), -1).astype(np.float32))
 
 
 def write_video(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float = 30.0) -> None:

@@ -8,13 +8,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench.camera import Camera
+from ihbench.camera import Camera, off_orthogonal
 from ihbench.datasets.reading.capture_folder import BY_OPTIONS
 from ihbench.errors import BadInput
 
+FARTHEST = 100.0  # m from the origin: captures are made in rooms
 
-def numbers(content: Any, key: str, shape: tuple[int, ...], where: object) -> NDArray[np.float64]:
-    """One entry as finite float64 of a shape, where -1 is any length; a new array.
+
+def numbers(
+    content: Any, key: str, shape: tuple[int, ...], where: object, finite: bool = True
+) -> NDArray[np.float64]:
+    """One entry as float64 of a shape, where -1 is any length; a new array, without NaN and infinity if `finite`.
 
     Rows and columns pass as vectors, 72 numbers as [24, 3]. Raises `BadInput` that starts with `where`.
     """
@@ -33,7 +37,7 @@ def numbers(content: Any, key: str, shape: tuple[int, ...], where: object) -> ND
         if not _fits(squeezed.shape, shape):
             raise BadInput(f"{expected}, found {list(value.shape)}")
         value = squeezed
-    if not np.isfinite(value).all():
+    if finite and not np.isfinite(value).all():
         raise BadInput(
             f"{where}: NaN or infinity in {key!r}; expected finite numbers, leave a frame out {BY_OPTIONS}"
         )
@@ -52,6 +56,20 @@ def described(value: object) -> str:
     if isinstance(value, np.ndarray):
         return f"a {value.dtype} array of shape {list(value.shape)}"
     return f"a {type(value).__name__}"
+
+
+def check_calibration(K: NDArray[np.float64], E: NDArray[np.float64], where: object) -> None:
+    """Raise `BadInput` unless K is a pinhole's and E a rigid world-to-camera transform in metres."""
+    if K[0, 0] <= 0 or K[1, 1] <= 0 or np.abs(K[2] - [0, 0, 1]).max() > 1e-6 or abs(K[1, 0]) > 1e-6:
+        raise BadInput(f"{where}: expected intrinsics [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] px, found another matrix")
+    R = E[:3, :3]
+    if off_orthogonal(R) > 1e-3 or np.linalg.det(R) < 0 or np.abs(E[3] - [0, 0, 0, 1]).max() > 1e-6:
+        raise BadInput(f"{where}: expected extrinsics [[R, t], [0, 1]] with a rotation R, found another matrix")
+    if np.linalg.norm(E[:3, 3]) > FARTHEST:
+        raise BadInput(
+            f"{where}: the camera stands {np.linalg.norm(E[:3, 3]):.4g} from the origin; expected metres, divide the "
+            f"extrinsics' t by 1000 if it is in millimetres"
+        )
 
 
 def extrinsic(camera: Camera) -> NDArray[np.float64]:

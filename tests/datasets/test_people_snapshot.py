@@ -25,6 +25,7 @@ from ihbench.datasets.people_snapshot.instantavatar import InstantAvatarFolder
 from ihbench.datasets.people_snapshot.original import PeopleSnapshotRaw
 from ihbench.errors import BadInput
 from ihbench.files import atomic
+from ihbench.files.npz import write_npz
 
 WIDTH, HEIGHT, N = 48, 64, 8
 SUBJECT = "male-3-casual"
@@ -102,6 +103,12 @@ def write_instantavatar(folder, scene):
     instantavatar.write_poses(folder, scene.poses)
     for frame in range(N):
         instantavatar.write_frame(folder, frame, scene.images[frame], scene.plain_masks[frame])
+
+
+def write_refined(folder, split, frames, poses):
+    pose, trans, betas = people_snapshot.stacked(poses)
+    path = folder / f"poses/anim_nerf_{split}.npz"
+    write_npz(path, {"betas": betas, "thetas": pose, "transl": trans, "frames": np.array(frames)})
 
 
 def write_gaussianavatar(folder, scene):
@@ -295,11 +302,11 @@ def test_betas_must_be_the_same_in_all_frames(tmp_path, scene):
 
 def test_frames_in_any_order_are_exact(written):
     video = people_snapshot.Video(written["raw"] / SUBJECT / f"{SUBJECT}.mp4")
-    assert (video.n_frames, video.size, video.fps) == (N, (HEIGHT, WIDTH), 30)
+    assert (video.n_frames, video.size) == (N, (HEIGHT, WIDTH))
     forward = [video.frame(i) for i in range(N)]
     for i in (7, 3, 3, 5, 0, 6, 1, 7, 2):
         np.testing.assert_array_equal(video.frame(i), forward[i])
-    assert len(video._kept) <= people_snapshot.KEPT_PICTURES
+    assert video._decoded.cache_info().currsize <= people_snapshot.KEPT_PICTURES
     video.frame(4)[:] = 0  # what is handed out may be painted on
     np.testing.assert_array_equal(video.frame(4), forward[4])
 
@@ -459,13 +466,12 @@ def test_consensus_and_keypoints_come_back(raw, scene):
     rng = np.random.default_rng(0)
     offsets, keypoints = rng.normal(size=(6890, 3)), rng.uniform(0, 60, (N, 18, 3)).astype(np.float32)
     people_snapshot.write_consensus(raw, BETAS + 0.25, offsets)
-    people_snapshot.write_keypoints(raw, keypoints)
+    with h5py.File(raw / "keypoints.hdf5", "w") as file:
+        file["keypoints"] = keypoints.reshape(N, 54)
     betas, v_personal = people_snapshot.read_consensus(raw / "consensus.pkl")
     np.testing.assert_array_equal(betas, BETAS + 0.25)
     np.testing.assert_array_equal(v_personal, offsets)
     np.testing.assert_array_equal(people_snapshot.read_keypoints(raw / "keypoints.hdf5"), keypoints)
-    with h5py.File(raw / "keypoints.hdf5") as file:
-        assert file["keypoints"].shape == (N, 54)
     report = PeopleSnapshotRaw.check(raw)
     assert problems(report) == ""
     assert report.subjects[0].consensus_betas == 0.25
@@ -474,9 +480,7 @@ def test_consensus_and_keypoints_come_back(raw, scene):
     rewrite_hdf5(raw / "keypoints.hdf5", keypoints=np.zeros((N, 51)))
     found = problems(PeopleSnapshotRaw.check(raw))
     assert "consensus.pkl: cannot be read" in found
-    assert "'keypoints' of shape [N, 54], found [8, 51]" in found
-    with pytest.raises(ValueError, match="shape"):
-        people_snapshot.write_keypoints(raw, keypoints[..., :2])
+    assert "'keypoints' to be numbers of shape [n, 54], found [8, 51]" in found
 
 
 def test_hdf5_with_damaged_masks(raw):
@@ -498,15 +502,30 @@ def test_hdf5_with_damaged_masks(raw):
     [
         ("masks.hdf5", {"masks": None}, "expected a data set 'masks' in it, found nothing"),
         ("reconstructed_poses.hdf5", {"trans": None}, "expected a data set 'trans' in it, found betas, pose"),
-        ("masks.hdf5", {"masks": np.zeros((N, HEIGHT))}, r"'masks' of shape \[N, N, N\], found \[8, 64\]"),
-        ("masks.hdf5", {"masks": np.zeros((0, HEIGHT, WIDTH))}, "found none"),
-        ("masks.hdf5", {"masks": b"text"}, "to hold numbers"),
-        ("masks.hdf5", {"masks": h5py.ExternalLink("other.hdf5", "masks")}, "expected a data set 'masks'"),
+        (
+            "masks.hdf5",
+            {"masks": np.zeros((N, HEIGHT))},
+            r"shape \[N, H, W\], found float64 \[8, 64\]",
+        ),
+        ("masks.hdf5", {"masks": np.zeros((0, HEIGHT, WIDTH))}, "shape .N, H, W."),
+        ("masks.hdf5", {"masks": b"text"}, "to be numbers"),
         ("masks.hdf5", {"masks": np.zeros((N, HEIGHT, 40), np.int8)}, r"40×64 px, but camera.pkl says 48×64 px"),
-        ("reconstructed_poses.hdf5", {"pose": np.zeros((N, 69))}, r"'pose' of shape \[N, 72\], found \[8, 69\]"),
-        ("reconstructed_poses.hdf5", {"trans": np.zeros((N, 4))}, r"'trans' of shape \[N, 3\], found \[8, 4\]"),
-        ("reconstructed_poses.hdf5", {"trans": np.zeros((N - 1, 3))}, "8 poses, 7 trans"),
-        ("reconstructed_poses.hdf5", {"betas": np.zeros(9)}, "expected 10 numbers in 'betas', found 9"),
+        (
+            "reconstructed_poses.hdf5",
+            {"pose": np.zeros((N, 69))},
+            r"'pose' .* shape \[n, 72\], found \[8, 69\]",
+        ),
+        (
+            "reconstructed_poses.hdf5",
+            {"trans": np.zeros((N, 4))},
+            r"'trans' .* shape \[n, 3\], found \[8, 4\]",
+        ),
+        (
+            "reconstructed_poses.hdf5",
+            {"trans": np.zeros((N - 1, 3))},
+            "'trans' for each 'pose', found 7 and 8",
+        ),
+        ("reconstructed_poses.hdf5", {"betas": np.zeros(9)}, r"'betas' to be numbers of shape \[10\], found \[9\]"),
         ("reconstructed_poses.hdf5", {"betas": np.full(10, np.nan)}, "NaN or infinity in 'betas'"),
     ],
 )
@@ -637,7 +656,7 @@ def test_masks_of_several_kinds(instant, scene, kind):
 @pytest.mark.parametrize(
     ("stored", "expected"),
     [
-        (np.zeros((HEIGHT, WIDTH, 3)), r"shape \[H, W\], found float64 of shape \[64, 48, 3\]"),
+        (np.zeros((HEIGHT, WIDTH, 3)), r"shape \[H, W\], found a float64 array of shape \[64, 48, 3\]"),
         (np.zeros((HEIGHT, WIDTH - 1)), "47×64 px, but the camera's images are 48×64 px"),
         (np.full((HEIGHT, WIDTH), np.nan), "0 to 255, found nan"),
         (np.full((HEIGHT, WIDTH), 1000), "0 to 255, found 1000"),
@@ -653,15 +672,15 @@ def test_bad_mask_arrays(instant, stored, expected):
 
 def test_refined_poses_replace_those_of_their_frames(instant, scene):
     refined = [dataclasses.replace(p, transl=p.transl + 0.5, betas=BETAS + 1) for p in scene.poses]
-    instantavatar.write_refined(instant, "train", [1, 3], [refined[1], refined[3]])
-    instantavatar.write_refined(instant, "test", [6], [refined[6]])
+    write_refined(instant, "train", [1, 3], [refined[1], refined[3]])
+    write_refined(instant, "test", [6], [refined[6]])
     capture = InstantAvatarFolder(instant).open(SUBJECT)
     assert capture.variant == "instantavatar/anim_nerf"
     for frame in range(N):
         assert_same_pose(capture.body_pose(frame), (refined if frame in (1, 3, 6) else scene.poses)[frame])
     files = InstantAvatarFolder.check(instant).subjects[0].files
     assert (files["anim_nerf_train"], files["anim_nerf_test"]) == (2, 1)
-    instantavatar.write_refined(instant, "test", [3], [refined[3]])
+    write_refined(instant, "test", [3], [refined[3]])
     with pytest.raises(BadInput, match=r"frame 3 has refined poses in poses/anim_nerf_train.npz, too") as error:
         InstantAvatarFolder(instant).open(SUBJECT)
     message(error)
@@ -685,7 +704,7 @@ def test_refined_poses_of_the_official_splits(tmp_path, scene, subject, split, f
     poses = [dataclasses.replace(scene.poses[0], transl=[-1, 0, 3])] * 873
     instantavatar.write_poses(folder, poses)
     refined = [dataclasses.replace(scene.poses[0], transl=[frame, 0, 3]) for frame in frames]
-    instantavatar.write_refined(folder, split, list(frames), refined)
+    write_refined(folder, split, list(frames), refined)
     path = folder / f"poses/anim_nerf_{split}.npz"
     rewrite_npz(path, frames=None)
     capture = InstantAvatarFolder(tmp_path).open(subject)
@@ -715,7 +734,7 @@ def test_refined_poses_of_the_official_splits(tmp_path, scene, subject, split, f
     ],
 )
 def test_refined_poses_of_other_frames(instant, scene, frames, expected):
-    instantavatar.write_refined(instant, "train", [0, 1], scene.poses[:2])
+    write_refined(instant, "train", [0, 1], scene.poses[:2])
     rewrite_npz(instant / "poses/anim_nerf_train.npz", frames=None if frames is None else np.array(frames))
     with pytest.raises(BadInput, match=expected):
         InstantAvatarFolder(instant).open(SUBJECT)
@@ -727,19 +746,19 @@ def test_refined_poses_of_other_frames(instant, scene, frames, expected):
 @pytest.mark.parametrize(
     ("name", "changes", "expected"),
     [
-        ("cameras.npz", {"intrinsic": None}, "expected 'intrinsic' in it, found extrinsic, height, width"),
+        ("cameras.npz", {"intrinsic": None}, "'intrinsic' to be numbers .*, found no such key"),
         ("cameras.npz", {"intrinsic": np.eye(4)}, r"shape \[3, 3\], found \[4, 4\]"),
         ("cameras.npz", {"intrinsic": np.full((3, 3), np.nan)}, "finite"),
-        ("cameras.npz", {"extrinsic": np.eye(3)}, r"'extrinsic' of shape \[4, 4\]"),
-        ("cameras.npz", {"extrinsic": np.diag([-1.0, 1, 1, 1])}, "right-handed"),
+        ("cameras.npz", {"extrinsic": np.eye(3)}, r"'extrinsic' to be numbers of shape \[4, 4\]"),
+        ("cameras.npz", {"extrinsic": np.diag([-1.0, 1, 1, 1])}, "with a rotation R"),
         ("cameras.npz", {"extrinsic": np.full((4, 4), np.inf)}, "NaN or infinity in 'extrinsic'"),
-        ("cameras.npz", {"height": np.array(63.5)}, "whole number of pixels in 'height'"),
-        ("cameras.npz", {"width": np.array([48, 64])}, "one whole number of pixels in 'width'"),
-        ("poses.npz", {"thetas": None}, "expected 'thetas' in it, found betas, transl"),
-        ("poses.npz", {"thetas": np.zeros((N, 69))}, r"'thetas' of shape \[N, 72\], found \[8, 69\]"),
-        ("poses.npz", {"transl": np.zeros((3, 3))}, "expected one 'transl' for each pose, found 3 and 8"),
-        ("poses.npz", {"betas": np.zeros(3)}, "10 finite numbers in 'betas'"),
-        ("poses.npz", {"betas": np.array(["a"] * 10)}, "'betas' to hold numbers"),
+        ("cameras.npz", {"height": np.array(63.5)}, "width and height in whole pixels"),
+        ("cameras.npz", {"width": np.array([48, 64])}, r"'width' to be numbers of shape \[1\], found \[2\]"),
+        ("poses.npz", {"thetas": None}, "'thetas' to be numbers .*, found no such key"),
+        ("poses.npz", {"thetas": np.zeros((N, 69))}, r"'thetas' to be numbers of shape \[n, 72\], found \[8, 69\]"),
+        ("poses.npz", {"transl": np.zeros((3, 3))}, "expected one 'transl' for each 'thetas', found 3 and 8"),
+        ("poses.npz", {"betas": np.zeros(3)}, r"'betas' to be numbers of shape \[10\]"),
+        ("poses.npz", {"betas": np.array(["a"] * 10)}, "'betas' to be numbers"),
     ],
 )
 def test_npz_of_another_shape(instant, name, changes, expected):
@@ -785,8 +804,6 @@ def test_undistorted_layouts_refuse_distortion(tmp_path, scene):
         instantavatar.write_camera(tmp_path, scene.camera)
     with pytest.raises(ValueError, match="distortion"):
         gaussianavatar.write_camera(tmp_path, "train", scene.camera)
-    with pytest.raises(ValueError, match="split"):
-        gaussianavatar.write_camera(tmp_path, "val", scene.plain)
 
 
 # --------------------------------------------------------------------------------------- gaussianavatar
@@ -877,14 +894,14 @@ def change_parameters(folder, **changes):
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"trans": None}, r"beta, body_pose and trans, found \['beta', 'body_pose'\]"),
-        ({"body_pose": torch.zeros(3, 69)}, r"shape \[N, 72\] in 'body_pose', found \[3, 69\]"),
+        ({"trans": None}, "'trans' to be numbers .*, found no such key"),
+        ({"body_pose": torch.zeros(3, 69)}, r"'body_pose' to be numbers of shape \[n, 72\], found \[3, 69\]"),
         ({"body_pose": torch.zeros(2, 72), "trans": torch.zeros(2, 3)}, "2 poses, but train/images holds 3 images"),
         ({"trans": torch.zeros(2, 3)}, "found 2 and 3"),
-        ({"beta": torch.zeros(1, 9)}, r"shape \[1, 10\] in 'beta'"),
-        ({"beta": [0.0] * 10}, r"expected a tensor \[1, 10\] in 'beta', found a list"),
+        ({"beta": torch.zeros(1, 9)}, r"'beta' to be numbers of shape \[10\], found"),
+        ({"beta": [0.0] * 10}, "expected a tensor of numbers in 'beta', found a list"),
         ({"trans": torch.full((3, 3), torch.nan)}, "NaN or infinity in the trans of row 0"),
-        ({"beta": torch.full((1, 10), torch.inf)}, "NaN or infinity in the betas"),
+        ({"beta": torch.full((1, 10), torch.inf)}, "NaN or infinity in 'beta'"),
         ({"trans": np.zeros((3, 3))}, "not a file of plain tensors"),
     ],
 )
