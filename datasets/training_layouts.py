@@ -44,7 +44,7 @@ def _one_camera(handout: Handout, folder: Path, camera: str, fit: str, write_fra
 def human_nerf(handout: Handout) -> Path:
     """HumanNeRF's and OccNeRF's layout, one camera."""
     folder = handout.folder / handout.name
-    names = [humannerf.view_name(number) for number in range(handout.n_views)]
+    names = [f"frame_{number:06d}" for number in range(handout.n_views)]
     pairs = zip(names, zip(handout.cameras, handout.body_poses, strict=True), strict=True)
     humannerf.write_pickles(folder, dict(pairs), handout.body)
     for view in handout.views():

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench.body import Body, from_zju_root, load_body, write_body, zju_root
+from ihbench.body import Body, from_zju_root, load_body, zju_root
 from ihbench.body.pose import BodyPose
 from ihbench.body.skeleton import pose_hint
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
@@ -563,13 +563,3 @@ def as_mask(mask: Any) -> NDArray | None:
             f"mask: soft, {len(values)} different values, and all above 0 are person; threshold it: {word}"
         )
     return array
-
-
-def write_body_file(folder: Path, body: Body) -> None:
-    """body.npz, the body that the poses belong to; `PlainCapture.model` reads it."""
-    write_body(Path(folder) / BODY_FILE, body)
-
-
-def write_about(folder: Path, name: str, about: str = "") -> None:
-    """scene.json; `read_about` undoes it."""
-    atomic.write_json(Path(folder) / SCENE_FILE, {"name": name, "about": about})

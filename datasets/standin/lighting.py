@@ -22,11 +22,6 @@ class Lighting:
     towards: NDArray[np.float64]  # [L, 3] unit directions from the surface to the lamps, world
     colours: NDArray[np.float64]  # [L, 3] RGB
 
-    def __post_init__(self) -> None:
-        length = np.linalg.norm(self.towards, axis=1)
-        if self.towards.shape != self.colours.shape or not np.allclose(length, 1):
-            raise ValueError(f"lighting: expected unit directions and colours [L, 3], got lengths {length}")
-
     def shade(self, normals: NDArray[np.float64]) -> NDArray[np.float64]:
         """Unit normals [..., 3], world -> light [..., 3] to multiply the albedo with. The renderer's slow twin."""
         facing = 0.5 + 0.5 * normals @ self.towards.T

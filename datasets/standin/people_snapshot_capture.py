@@ -50,7 +50,37 @@ class PeopleSnapshotStandIn(StandIn):
 
     @staticmethod
     def make(folder: Path, name: str, subject: Subject, missing: bool, progress: Progress) -> None:
-        _write_subject(folder, name, subject, progress)
+        show = motion.turntable(subject.rng("turntable"), N_FRAMES, TURNS)
+        poses = motion.body_poses(show, subject.betas, subject.body)
+        camera = studio_camera(subject.rng("camera"))
+        background = empty_studio(camera, subject.studio_seed)
+        masks: NDArray[np.bool_] = np.zeros((N_FRAMES, SIZE, SIZE), bool)
+
+        def shoot(frame: int) -> Photograph:
+            surface = subject.body.pose(poses[frame], offsets=subject.offsets)
+            return subject.photograph(surface, camera, background)
+
+        def frames(pool: ThreadPoolExecutor) -> Iterator[NDArray[np.uint8]]:
+            with progress.task(f"filming {name}", total=N_FRAMES) as task:
+                step = 8  # photographs in memory
+                for start in range(0, N_FRAMES, step):
+                    some = range(start, min(start + step, N_FRAMES))
+                    for frame, shot in zip(some, pool.map(shoot, some), strict=True):
+                        masks[frame] = shot.mask
+                        yield shot.image
+                        task.advance()
+
+        shoot(0)  # computes what the threads share before they start
+        with ThreadPoolExecutor((os.cpu_count() or 1) + 1) as pool:
+            people_snapshot.write_video(folder / f"{folder.name}.mp4", frames(pool))
+        own = Camera(camera.K, np.eye(3), np.zeros(3), SIZE, SIZE, camera.distortion)
+        people_snapshot.write_camera(folder, own)
+        people_snapshot.write_masks(folder, masks, masks.shape)
+        people_snapshot.write_consensus(folder, subject.betas, subject.offsets)
+        texture = np.rint(np.clip(subject.texture, 0, 1) * 255).astype(np.uint8)
+        atomic.write_bytes(folder / "truth" / "texture.png", encoded(texture, "PNG"))
+        pelvis = subject.body.shaped(subject.betas)[1][0]
+        people_snapshot.write_poses(folder, [in_camera_space(pose, camera, pelvis) for pose in poses])
 
 
 def studio_camera(rng: np.random.Generator) -> Camera:
@@ -73,38 +103,3 @@ def in_camera_space(body_pose: BodyPose, camera: Camera, pelvis: NDArray[np.floa
     pose[0] = Rotation.from_matrix(camera.R @ axis_angle_to_matrix(body_pose.pose[0])).as_rotvec()
     transl = camera.R @ (pelvis + body_pose.transl) + camera.t - pelvis
     return BodyPose(pose, body_pose.betas, transl)
-
-
-def _write_subject(folder: Path, name: str, subject: Subject, progress: Progress) -> None:
-    show = motion.turntable(subject.rng("turntable"), N_FRAMES, TURNS)
-    poses = motion.body_poses(show, subject.betas, subject.body)
-    camera = studio_camera(subject.rng("camera"))
-    background = empty_studio(camera, subject.studio_seed)
-    masks: NDArray[np.bool_] = np.zeros((N_FRAMES, SIZE, SIZE), bool)
-
-    def shoot(frame: int) -> Photograph:
-        surface = subject.body.pose(poses[frame], offsets=subject.offsets)
-        return subject.photograph(surface, camera, background)
-
-    def frames(pool: ThreadPoolExecutor) -> Iterator[NDArray[np.uint8]]:
-        with progress.task(f"filming {name}", total=N_FRAMES) as task:
-            step = 8  # photographs in memory
-            for start in range(0, N_FRAMES, step):
-                for frame, shot in zip(
-                    range(start, N_FRAMES), pool.map(shoot, range(start, min(start + step, N_FRAMES))), strict=False
-                ):
-                    masks[frame] = shot.mask
-                    yield shot.image
-                    task.advance()
-
-    shoot(0)  # computes what the threads share before they start
-    with ThreadPoolExecutor((os.cpu_count() or 1) + 1) as pool:
-        people_snapshot.write_video(folder / f"{folder.name}.mp4", frames(pool))
-    own = Camera(camera.K, np.eye(3), np.zeros(3), SIZE, SIZE, camera.distortion)
-    people_snapshot.write_camera(folder, own)
-    people_snapshot.write_masks(folder, masks, masks.shape)
-    people_snapshot.write_consensus(folder, subject.betas, subject.offsets)
-    texture = np.rint(np.clip(subject.texture, 0, 1) * 255).astype(np.uint8)
-    atomic.write_bytes(folder / "truth" / "texture.png", encoded(texture, "PNG"))
-    pelvis = subject.body.shaped(subject.betas)[1][0]
-    people_snapshot.write_poses(folder, [in_camera_space(pose, camera, pelvis) for pose in poses])

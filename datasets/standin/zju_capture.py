@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,17 +21,13 @@ ALL_FRAMES = N_FRAMES + NOVEL_FRAMES
 PATHS = zju_mocap.standard_image_paths(N_CAMERAS, ALL_FRAMES)  # by frame and camera
 
 
-@dataclass(frozen=True)
-class Missing:
+class Missing(NamedTuple):
     """What is to be made of one subject."""
 
     annots: bool
     pictures: list[tuple[int, int]]  # camera, frame
     vertices: list[int]  # frames
     params: list[int]  # frames
-
-    def __bool__(self) -> bool:
-        return bool(self.annots or self.pictures or self.vertices or self.params)
 
 
 class ZjuStandIn(StandIn):
@@ -49,15 +45,16 @@ class ZjuStandIn(StandIn):
         return tuple(str(Path(image).parent) for image in PATHS[0])
 
     @staticmethod
-    def missing(folder: Path, frames_of: dict[int, list[int]]) -> Missing:
+    def missing(folder: Path, frames_of: dict[int, list[int]]) -> Missing | None:
         pairs = [(camera, frame) for camera, frames in frames_of.items() for frame in frames]
         frames = sorted({frame for _, frame in pairs})
-        return Missing(
+        missing = Missing(
             annots=not (folder / "annots.npy").is_file(),
             pictures=[(camera, frame) for camera, frame in pairs if not _all_there(folder, PATHS[frame][camera])],
             vertices=[frame for frame in frames if not (folder / "new_vertices" / f"{frame}.npy").is_file()],
             params=[frame for frame in range(ALL_FRAMES) if not (folder / "new_params" / f"{frame}.npy").is_file()],
         )
+        return missing if any(missing) else None
 
     @staticmethod
     def make(folder: Path, name: str, subject: Subject, missing: Missing, progress: Progress) -> None:

@@ -181,16 +181,10 @@ def _dictionary(path: Path) -> dict[str, Any]:
 # ----------------------------------------------------------------------------------------------- write
 
 
-def view_name(frame: int, camera: int | None = None) -> str:
-    """The name of a view; `camera` counts from 0 and is None where there is only one."""
-    return f"frame_{frame:06d}" if camera is None else f"camera_{camera + 1:02d}_frame_{frame:06d}"
-
-
 def write_pickles(
     folder: Path,
     views: Mapping[str, tuple[Camera, BodyPose]],  # name -> camera and pose of that view
     body: Body,
-    with_betas: bool = True,
 ) -> None:
     """cameras.pkl, mesh_infos.pkl and canonical_joints.pkl; the reader undoes them to 1e-12."""
     cameras, infos = {}, {}
@@ -207,16 +201,12 @@ def write_pickles(
             "poses": poses.reshape(72),
             "joints": body.posed_joints(unturned),
             "tpose_joints": body.shaped(body_pose.betas)[1],
+            "betas": body_pose.betas.copy(),
         }
-        if with_betas:
-            infos[name]["betas"] = body_pose.betas.copy()
     mean = np.mean([pose.betas for _, pose in views.values()], 0)
-    canonical: dict[str, NDArray[np.float64]] = {"joints": body.shaped(mean)[1]}
-    if with_betas:
-        canonical["avg_betas"] = mean
     write_pickle(folder / "cameras.pkl", cameras)
     write_pickle(folder / "mesh_infos.pkl", infos)
-    write_pickle(folder / "canonical_joints.pkl", canonical)
+    write_pickle(folder / "canonical_joints.pkl", {"joints": body.shaped(mean)[1], "avg_betas": mean})
 
 
 def write_view(folder: Path, name: str, image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> None:

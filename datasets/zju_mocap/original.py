@@ -230,19 +230,13 @@ def read_annots(path: Path) -> Annots:
 
 
 def _camera_field(cams: dict, key: str, path: Path) -> NDArray[np.float64]:
+    """[N, …]; vectors may be stored as columns or rows."""
     shape = CAMERA_SHAPES[key]
     expected = f"expected cams[{key!r}] to be one array of shape {list(shape)} for each camera"
-    if key not in cams:
-        raise BadInput(f"{path}: {expected}, found no such key")
     try:
-        stacked = np.array([np.asarray(value, np.float64) for value in cams[key]])
-    except (TypeError, ValueError):
-        raise BadInput(f"{path}: {expected}, found {described(cams[key])} of other contents") from None
-    flat_vector = len(shape) == 1 and stacked.ndim == 3 and 1 in stacked.shape[1:]
-    if flat_vector:  # stored as a column or a row
-        stacked = stacked.reshape(len(stacked), -1)
-    if stacked.shape[1:] != shape:
-        raise BadInput(f"{path}: {expected}, found {list(stacked.shape[1:])}")
+        stacked = np.array([np.reshape(np.asarray(value, np.float64), shape) for value in cams[key]])
+    except (KeyError, TypeError, ValueError):
+        raise BadInput(f"{path}: {expected}, found {described(cams.get(key))} of other contents") from None
     if not np.isfinite(stacked).all():
         raise BadInput(f"{path}: {expected}, found NaN or infinity in it")
     return stacked

@@ -70,11 +70,6 @@ class ZjuRefineCapture(ZjuCapture):
         return path.relative_to("images") if path.parts[:1] == ("images",) else path
 
 
-def standard_image_paths(n_cameras: int, n_frames: int) -> list[list[str]]:
-    """Per frame the paths that annots.npy lists: images/00/000000.jpg for camera 0, frame 0."""
-    return [[f"images/{camera:02d}/{frame:06d}.jpg" for camera in range(n_cameras)] for frame in range(n_frames)]
-
-
 def write_frame(folder: Path, image_path: str, image: NDArray[np.uint8], mask: NDArray) -> None:
     """The picture files of one camera at one frame; `image_path` as annots.npy lists it, with images/ in front."""
     zju_mocap.write_frame(folder, image_path, image)

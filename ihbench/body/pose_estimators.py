@@ -187,22 +187,9 @@ def matrix_to_axis_angle(
     if R.shape[-2:] != (3, 3):
         raise BadInput(f"rotation matrices: expected shape [..., 3, 3], got {list(R.shape)}")
     check_rotation(R, "rotation matrices")
-    m = {(i, j): R[..., i, j] for i in range(3) for j in range(3)}
-    # 4 q qᵀ, a row for each of w, x, y, z: every row is the quaternion, scaled; the longest loses no digits
-    products = [
-        [1 + m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
-        [m[2, 1] - m[1, 2], 1 + m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
-        [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], 1 - m[0, 0] + m[1, 1] - m[2, 2], m[1, 2] + m[2, 1]],
-        [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], 1 - m[0, 0] - m[1, 1] + m[2, 2]],
-    ]
-    table = np.stack([np.stack(row, -1) for row in products], -2)  # [..., 4, 4]
-    longest = np.diagonal(table, axis1=-2, axis2=-1).argmax(-1)
-    q = np.take_along_axis(table, longest[..., None, None], -2)[..., 0, :]
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    q = np.where(q[..., :1] < 0, -q, q)
-    sine = np.linalg.norm(q[..., 1:], axis=-1)
-    angle = 2 * np.arctan2(sine, q[..., 0])
-    return q[..., 1:] * np.where(sine > 0, angle / np.where(sine > 0, sine, 1), 2)[..., None]
+    from scipy.spatial.transform import Rotation
+
+    return np.reshape(Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec(), R.shape[:-1])
 
 
 def six_d_to_matrix(

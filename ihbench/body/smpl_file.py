@@ -115,11 +115,10 @@ def _foreign_array(value: ForeignObject, where: str) -> NDArray:
         shape = tuple(int(n) for n in state.get("_shape", state.get("shape", ())))
         if len(shape) != 2 or shape[0] * shape[1] > MAX_ELEMENTS:
             raise BadInput(f"{where}: a sparse matrix of shape {shape}")
-        dense = np.zeros(shape)
-        major = np.repeat(np.arange(len(state["indptr"]) - 1), np.diff(state["indptr"]))
-        rows, columns = (state["indices"], major) if kind.startswith("csc") else (major, state["indices"])
-        np.add.at(dense, (rows, columns), state["data"])
-        return dense
+        from scipy import sparse
+
+        matrix = getattr(sparse, kind)((state["data"], state["indices"], state["indptr"]), shape)
+        return matrix.toarray().astype(np.float64)
     if "idxs" in state:  # chumpy.reordering.Select: a slice of another object
         selected = _plain_array(state["a"], where).ravel()[np.asarray(state["idxs"])]
         return selected.reshape(state.get("preferred_shape", -1))

@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from ihbench.body import load_body
+from ihbench.body import load_body, write_body
 from ihbench.body.pose import BodyPose
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera, look_at
@@ -60,7 +60,7 @@ def write_scene(folder, body, cameras=None, poses=None, numbers=FRAMES, own=True
     plain_scene.write_cameras(folder, cameras)
     plain_scene.write_poses(folder, poses, numbers, root, body)
     if own:
-        plain_scene.write_body_file(folder, body)
+        write_body(folder / "body.npz", body)
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     images, masks = {}, {}
     for k, (name, camera) in enumerate(cameras.items()):
@@ -222,7 +222,7 @@ def test_the_zju_root_is_understood(tmp_path, own_body):
     poses = make_poses(own_body)
     off_centre = dataclasses.replace(own_body, v_template=own_body.v_template + np.array([0.02, -0.25, 0.03]))
     plain_scene.write_cameras(tmp_path / "z", make_cameras())
-    plain_scene.write_body_file(tmp_path / "z", off_centre)
+    write_body(tmp_path / "z" / "body.npz", off_centre)
     plain_scene.write_poses(tmp_path / "z", poses, root="zju", body=off_centre)
     capture = PlainScene(tmp_path / "z").open("z")
     for frame, pose in enumerate(poses):
@@ -296,18 +296,18 @@ def test_several_scenes_are_named_by_folder_or_file(tmp_path, own_body):
     for name in ("a", "b"):
         plain_scene.write_cameras(tmp_path / name, make_cameras())
         plain_scene.write_poses(tmp_path / name, make_poses(own_body))
-    plain_scene.write_about(tmp_path / "b", "zoe walks", "filmed in the yard")
+    atomic.write_json(tmp_path / "b" / "scene.json", {"name": "zoe walks", "about": "filmed in the yard"})
     (tmp_path / "notes").mkdir()
     dataset = PlainScene(tmp_path)
     assert dataset.subjects() == ["a", "zoe walks"]
     assert dataset.open("zoe walks").about == "filmed in the yard"
     with pytest.raises(BadInput, match="did you mean 'zoe walks'"):
         dataset.open("zoe walk")
-    plain_scene.write_about(tmp_path / "b", "a")
+    atomic.write_json(tmp_path / "b" / "scene.json", {"name": "a", "about": ""})
     with pytest.raises(BadInput, match="named 'a'"):
         PlainScene(tmp_path)
     for name in ("", "x/y", "..", "a\nb"):
-        plain_scene.write_about(tmp_path / "b", name)
+        atomic.write_json(tmp_path / "b" / "scene.json", {"name": name, "about": ""})
         with pytest.raises(BadInput, match=r"scene\.json"):
             PlainScene(tmp_path)
         for look in (partial(open_dataset, "custom"), lambda folder: data.main(["check", str(folder)])):
@@ -700,7 +700,7 @@ def test_the_examples_of_the_page_run(tmp_path, own_body):
         }
         known["images"] = [np.zeros((HEIGHT, WIDTH, 3), np.uint8)]
         exec("from ihbench.datasets.plain import plain_scene\n" + example, known)
-        plain_scene.write_body_file(known["folder"], body)
+        write_body(known["folder"] / "body.npz", body)
         capture = PlainScene(known["folder"]).open(kind)
         known["masks"] = [255 * silhouette(body, capture.body_pose(0), capture.camera(0)).astype(np.uint8)]
         middle = np.argwhere(known["masks"][0]).mean(0)

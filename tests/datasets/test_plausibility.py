@@ -8,7 +8,7 @@ import pytest
 from PIL import Image, ImageFilter
 from scipy.spatial.transform import Rotation
 
-from ihbench.body import load_body
+from ihbench.body import load_body, write_body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.datasets.plain import plain_scene
@@ -41,7 +41,7 @@ def scene(tmp_path_factory):
         plain_scene.write_frame(folder, frame, image, mask)
     plain_scene.write_cameras(folder, {"main": camera})
     plain_scene.write_poses(folder, poses)
-    plain_scene.write_body_file(folder, body)
+    write_body(folder / "body.npz", body)
     return folder
 
 

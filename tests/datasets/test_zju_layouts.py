@@ -18,6 +18,7 @@ from ihbench.datasets.zju_mocap.refine import ZjuRefine
 from ihbench.errors import BadInput
 
 WIDTH, HEIGHT, N_FRAMES = 64, 48, 3
+PATHS = [[f"images/{camera:02d}/{frame:06d}.jpg" for camera in range(2)] for frame in range(N_FRAMES)]
 
 
 @pytest.fixture(scope="module")
@@ -54,13 +55,12 @@ def scene(smpl):
 def refine(scene, smpl, tmp_path):
     cameras, poses, views = scene
     folder = tmp_path / "zju" / "my_377"
-    paths = zju_refine.standard_image_paths(2, N_FRAMES)
-    zju_mocap.write_annots(folder, cameras, paths)
+    zju_mocap.write_annots(folder, cameras, PATHS)
     for f, pose in enumerate(poses):
         zju_mocap.write_params(folder, f, pose, smpl, "smpl_params")
         zju_mocap.write_vertices(folder, f, smpl.pose(pose), "smpl_params")
         for c in range(2):
-            zju_refine.write_frame(folder, paths[f][c], *views[c, f])
+            zju_refine.write_frame(folder, PATHS[f][c], *views[c, f])
     return folder
 
 
@@ -74,10 +74,16 @@ def write_nerf(folder, scene, smpl, with_betas=True, monocular=False):
     listed = {}
     for c in range(1 if monocular else 2):
         for f, pose in enumerate(poses):
-            name = humannerf.view_name(f, None if monocular else c)
+            name = f"frame_{f:06d}" if monocular else f"camera_{c + 1:02d}_frame_{f:06d}"
             listed[name] = cameras[c], pose
             humannerf.write_view(folder, name, *views[c, f])
-    humannerf.write_pickles(folder, listed, smpl, with_betas)
+    humannerf.write_pickles(folder, listed, smpl)
+    if not with_betas:
+        infos = pickle.loads((folder / "mesh_infos.pkl").read_bytes())
+        for info in infos.values():
+            del info["betas"]
+        (folder / "mesh_infos.pkl").write_bytes(pickle.dumps(infos))
+        (folder / "canonical_joints.pkl").unlink()
     return folder
 
 
@@ -110,21 +116,18 @@ def test_refine_has_no_cihp_masks(refine, smpl):
 
 
 def test_refine_paths_may_lack_the_folder_images(refine, scene, smpl):
-    zju_mocap.write_annots(
-        refine, scene[0], [[p.removeprefix("images/") for p in f] for f in zju_refine.standard_image_paths(2, 3)]
-    )
+    zju_mocap.write_annots(refine, scene[0], [[p.removeprefix("images/") for p in f] for f in PATHS])
     check_same(ZjuRefine(refine).open("377", smpl), scene, smpl, lossless=False)
 
 
 @pytest.mark.parametrize("monocular", [True, False])
 @pytest.mark.parametrize("with_betas", [True, False])
 def test_humannerf_round_trip(tmp_path, scene, smpl, with_betas, monocular):
-    folder = write_nerf(tmp_path / "377", scene, smpl, with_betas, monocular)
+    write_nerf(tmp_path / "377", scene, smpl, with_betas, monocular)
     capture = HumanNerfFormat(tmp_path).open("377", smpl)
     assert capture.camera_ids == (("camera",) if monocular else ("01", "02"))
     assert capture.n_frames == N_FRAMES
     check_same(capture, scene, smpl, lossless=True)
-    assert "betas" not in pickle.loads((folder / "canonical_joints.pkl").read_bytes()) or with_betas
 
 
 def test_betas_follow_from_joints(smpl):

@@ -26,6 +26,7 @@ import numpy as np
 import tyro
 
 from ihbench import registry
+from ihbench.body import write_body
 from ihbench.cli import COMMANDS, main
 from ihbench.datasets.plain import plain_scene
 from ihbench.errors import BadInput
@@ -156,7 +157,7 @@ class World:
             plain_scene.write_frame(root / "made", frame, picture, mask)
         plain_scene.write_cameras(scene, {"main": camera})
         plain_scene.write_poses(scene, poses, frames=list(range(6)))
-        plain_scene.write_body_file(scene, the_body())
+        write_body(scene / "body.npz", the_body())
         (root / "predictions" / "main").mkdir(parents=True)
         for file in (root / "made" / "images").rglob("*.png"):
             file.rename(root / "predictions" / "main" / file.name)

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from ihbench.body import load_body
+from ihbench.body import load_body, write_body
 from ihbench.cli import main
 from ihbench.clock.progress import Progress
 from ihbench.datasets.plain import plain_scene
@@ -29,7 +29,7 @@ def own_video(tmp_path_factory):
     poses = [a_pose(0.5 * k, 0.3) for k in range(10)]
     plain_scene.write_cameras(folder, {"phone": camera})
     plain_scene.write_poses(folder, poses)
-    plain_scene.write_body_file(folder, load_body())
+    write_body(folder / "body.npz", load_body())
     for k, pose in enumerate(poses):
         plain_scene.write_frame(folder, k, *photograph(camera, pose))
     return folder

@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 from ihbench import registry
+from ihbench.body import write_body
 from ihbench.camera import distort
 from ihbench.datasets.plain import plain_scene
 from ihbench.errors import BadInput
@@ -298,7 +299,7 @@ def behind_a_table_folder(tmp_path_factory):
     whole = turning_capture(10)
     plain_scene.write_cameras(folder, {"phone": whole.cameras[0]})
     plain_scene.write_poses(folder, whole.poses)
-    plain_scene.write_body_file(folder, the_body())
+    write_body(folder / "body.npz", the_body())
     for k in range(10):
         image, mask = whole.image(0, k), whole.silhouette(0, k)
         image[TABLE], mask[TABLE] = (150, 75, 0), False
