@@ -28,7 +28,7 @@ from ihbench.body import Body, from_zju_root, load_body, zju_root
 from ihbench.body.pose import BodyPose
 from ihbench.body.skeleton import pose_hint
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
-from ihbench.camera import Camera, off_orthogonal
+from ihbench.camera import Camera, check_intrinsics, check_rotation
 from ihbench.datasets.reading.capture_folder import PICTURES, CaptureFolder, Picture, picture_files
 from ihbench.datasets.reading.plausibility import SOFT_VALUES, Outline
 from ihbench.datasets.reading.standin_mark import STANDIN_FILE
@@ -275,20 +275,14 @@ def _camera(name: str, entry: Any, path: Path) -> Camera:
             raise BadInput(f"{where}: unknown key {key!r}: {nearest(key, list(CAMERA_KEYS))}")
     width, height = (_pixels(entry, key, where) for key in ("width", "height"))
     K, R, t = (numbers(entry, key, shape, where) for key, shape in (("K", (3, 3)), ("R", (3, 3)), ("t", (3,))))
-    if K[0, 0] <= 0 or K[1, 1] <= 0 or K[1, 0] != 0 or not np.array_equal(K[2], [0, 0, 1]):
-        raise BadInput(f"{where}: K: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0; check the signs")
-    if off_orthogonal(R) > 1e-3:
-        raise BadInput(f"{where}: R: expected a rotation matrix (R Rᵀ = 1), found another; leave scale and t out")
-    if np.linalg.det(R) < 0:
-        raise BadInput(f"{where}: R: expected a rotation, found a reflection (a left-handed world); flip one axis")
-    distortion = None
-    if entry.get("distortion") is not None:
-        distortion = numbers(entry, "distortion", (5,), where)
+    check_intrinsics(K, f"{where}: K")
+    check_rotation(R, f"{where}: R", 1e-3)
+    lens = None if entry.get("distortion") is None else numbers(entry, "distortion", (5,), where)
     center = entry.get("pixel_center", 0.0)
     if isinstance(center, bool) or center not in (0, 0.5):
         raise BadInput(f"{where}: pixel_center: expected 0.0 or 0.5, the centre of the first pixel; found {center!r}")
     K[:2, 2] += 0.5 - center
-    return Camera(K, R, t, width, height, distortion if distortion is not None and distortion.any() else None)
+    return Camera(K, R, t, width, height, lens if lens is not None and lens.any() else None)
 
 
 def _pixels(entry: Mapping[str, object], key: str, where: str) -> int:

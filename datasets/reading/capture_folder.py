@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
@@ -90,15 +91,13 @@ class CaptureFolder(ABC):
         """Hash of the bytes of one view's image and mask files; a missing or unreadable file counts as empty."""
         self.check_index(camera, frame)
         digest = hashlib.sha256()
-        try:
+        paths: tuple[Path, ...] = ()
+        with suppress(BadInput):  # the copy does not list it
             paths = self.files_of(camera, frame, source)
-        except BadInput:  # the copy does not list it
-            paths = ()
         for path in paths:
-            try:
-                content = path.read_bytes() if path.is_file() else b""
-            except OSError:
-                content = b""
+            content = b""
+            with suppress(OSError):
+                content = path.read_bytes()
             digest.update(self.digest_prefix(len(content)) + content)
         return digest.digest()
 

@@ -32,7 +32,6 @@ NEAREST, FARTHEST = 0.05, 100.0  # m; nobody films a person from there
 CLOTHES = 0.03  # of the drawn body's height: how far garments and hair may stand off it
 CLEARLY = 0.2  # how much more overlap tells that a change of the masks is what they need
 SHIFTS = (1, 2, 3, 4, 5, 7, 10)  # frames by which masks and poses are tried against each other
-WAYS = {"later": 1, "earlier": -1}
 CERTAIN = 0.08  # gain in overlap from which another order of the frames, or another place, is no chance
 STEADY = 0.8  # share of the compared views in which a shift must fit better
 LISTED = 3  # problems of one kind that are spelled out
@@ -100,38 +99,32 @@ class Overlap:
 
     camera: int
     frame: int
-    vertices_in_mask: float  # of the body's vertices, the mask grown by 1 % of the picture's width
-    mask_on_body: float  # of the mask, the body grown by `CLOTHES`; 1 for an empty mask
-    iou: dict[str, float]  # by what is changed, "" for nothing; all others only where that is low
-    area: float  # of the picture that is mask
-    border: float  # of the picture's border that is mask
-    body_area: float  # of the picture that is body
     mask: Mask  # [h, w]
     body: Mask  # [h, w]
     view: Camera  # of that size
     outline: Outline
+    vertices_in_mask: float  # of the body's vertices, the mask grown by 1 % of the picture's width
+    mask_on_body: float  # of the mask, the body grown by `CLOTHES`; 1 for an empty mask
+    iou: dict[str, float]  # by what is changed, "" for nothing; all others only where that is low
+
+    @property
+    def area(self) -> float:
+        """Of the picture that is mask."""
+        return float(self.mask.mean())
+
+    @property
+    def body_area(self) -> float:
+        return float(self.body.mean())
+
+    @property
+    def border(self) -> float:
+        """Of the picture's border that is mask."""
+        return float(np.concatenate([self.mask[0], self.mask[-1], self.mask[:, 0], self.mask[:, -1]]).mean())
 
     @property
     def in_picture(self) -> float:
         """The share of the body's vertices that lie in the picture."""
         return share_inside(self.view.project(self.outline.vertices), np.ones_like(self.mask))
-
-    @property
-    def reach(self) -> Array | None:
-        """[2] px, width and height of the projected body, also outside the picture; None where it is behind it."""
-        points = self.view.project(self.outline.vertices)
-        return np.ptp(points[:, :2], axis=0) if (points[:, 2] > 0).all() and self.mask.any() else None
-
-    def fitted(self) -> float:
-        """The overlap with the body once it is moved and scaled into the mask's box."""
-        points = self.view.undistorted().project(self.outline.vertices)[:, :2]
-        rows, columns = (np.flatnonzero(self.mask.any(axis)) for axis in (1, 0))
-        low, high = np.array([columns[0], rows[0]]), np.array([columns[-1] + 1, rows[-1] + 1])
-        scale = (high - low) / np.ptp(points, axis=0)
-        into = np.array([[scale[0], 0, low[0]], [0, scale[1], low[1]], [0, 0, 1.0]])
-        into[:2, 2] -= scale * points.min(0)
-        K = into @ self.view.K
-        return _iou(self.mask, self.outline.drawn(replace(self.view, K=K, distortion=None))[1])
 
 
 def share_inside(points: Array, region: Mask) -> float:
@@ -168,9 +161,7 @@ def examine(
     aimed = set(usable)
     views = _spread(views)
     if outline is not None:
-        frames = sorted({frame for _, frame in views}) or list(
-            range(0, capture.n_frames, max(1, capture.n_frames // 3))
-        )
+        frames = sorted({frame for _, frame in views}) or range(0, capture.n_frames, max(1, capture.n_frames // 3))
         posed = readable(frames, outline, lambda frame: f"frame {capture.label(frame)}", report)
         plausible = _check_shape(capture, report)
         aimed = set(_check_placement(capture, usable, list(posed.values())[:: max(1, len(posed) // 8)], report))
@@ -243,59 +234,51 @@ def _check_cameras(capture: CaptureFolder, report: SubjectReport) -> list[int]:
             if len(capture.camera_ids) == 1 or not capture.standin:  # a stand-in lacks images it was not asked for
                 report.problem(str(error))
             continue
-        complaint = absurd_camera(view)
-        if complaint:
+        if complaint := absurd_camera(view):
             report.problem(f"camera {name}: {complaint}")
             continue
         if suspicion := suspicious_camera(view):
             report.warn(f"camera {name}: {suspicion}")
         usable.append(camera)
         same.setdefault((view.K.tobytes(), view.R.round(9).tobytes(), view.t.round(9).tobytes()), []).append(name)
-    for names in same.values():
-        if len(names) > 1:
-            report.problem(
-                f"cameras {some(names)}: have one and the same K, R and t; expected each camera's own calibration"
-            )
+    for names in (names for names in same.values() if len(names) > 1):
+        report.problem(
+            f"cameras {some(names)}: have one and the same K, R and t; expected each camera's own calibration"
+        )
     return usable
 
 
 def absurd_camera(view: Camera) -> str:
     """What no camera can be, in one line; empty for others. Size and K only: what it sees is another question."""
-    side = max(view.width, view.height)
-    focal = view.K[0, 0], view.K[1, 1]
+    side, (x, y), focal = max(view.width, view.height), view.K[:2, 2], (view.K[0, 0], view.K[1, 1])
+    size = f"{view.width}×{view.height} px"
     if not 0.2 <= focal[0] / focal[1] <= 5:
         return f"focal lengths {focal[0]:.4g} and {focal[1]:.4g} px; expected about the same in x and y"
     for length in focal:
         if not 0.15 * side <= length <= 200 * side:
-            angle = 2 * np.degrees(np.arctan2(side / 2, length)) if length > 0 else 0
+            angle = 2 * np.degrees(np.arctan2(side / 2, length))
             return (
-                f"focal length {length:.4g} px for {view.width}×{view.height} px, a field of view of {angle:.3g}°; "
-                f"expected pixels of these pictures, about 0.5 to 5 times their longer side"
+                f"focal length {length:.4g} px for {size}, a field of view of {angle:.3g}°; expected pixels of these "
+                f"pictures, about 0.5 to 5 times their longer side"
             )
-    x, y = view.K[0, 2] / view.width, view.K[1, 2] / view.height
-    if max(abs(x - 0.5), abs(y - 0.5)) > 5:
-        return (
-            f"principal point ({view.K[0, 2]:.4g}, {view.K[1, 2]:.4g}) px, far outside "
-            f"{view.width}×{view.height} px; expected pixels of these pictures, near their middle"
-        )
+    if max(abs(x / view.width - 0.5), abs(y / view.height - 0.5)) > 5:
+        return f"principal point ({x:.4g}, {y:.4g}) px, far outside {size}; expected pixels, near the middle"
     return ""
 
 
 def suspicious_camera(view: Camera) -> str:
     """What few cameras are, in one line; empty for others."""
-    side, focal = max(view.width, view.height), (view.K[0, 0], view.K[1, 1])
-    x, y = 2 * view.K[0, 2] / view.width, 2 * view.K[1, 2] / view.height
+    side, focal, centre = max(view.width, view.height), (view.K[0, 0], view.K[1, 1]), view.K[:2, 2]
+    x, y = 2 * centre / (view.width, view.height)
     size = f"{view.width}×{view.height} px"
     if abs(x - y) < 0.15 * max(x, y) and not 0.65 < max(x, y) < 1.55:
         return (
-            f"K looks like that of pictures of about {2 * view.K[0, 2]:.0f}×{2 * view.K[1, 2]:.0f} px, but these are "
+            f"K looks like that of pictures of about {2 * centre[0]:.0f}×{2 * centre[1]:.0f} px, but these are "
             f"{size}; scale its first two rows with the pictures, unless these are a corner cut out of larger ones"
         )
     if not (0 <= x <= 2 and 0 <= y <= 2):
-        return (
-            f"principal point ({view.K[0, 2]:.4g}, {view.K[1, 2]:.4g}) px lies outside {size}; right only for "
-            f"pictures that were cut out of larger ones"
-        )
+        place = f"({centre[0]:.4g}, {centre[1]:.4g})"
+        return f"principal point {place} px lies outside {size}; right only for cut-out pictures"
     if not 0.8 <= focal[0] / focal[1] <= 1.25:
         return f"focal lengths {focal[0]:.4g} and {focal[1]:.4g} px; few cameras have pixels that are not square"
     if min(focal) < 0.4 * side or max(focal) > 25 * side:
@@ -333,7 +316,8 @@ def _check_placement(
             unit, factor = ("millimetres", 1000) if value > 900 else ("centimetres", 100)
             text = PLACES[kind].format(value=value, unit=unit, factor=factor)
             tell = report.warn if kind in ("small", "cut") else report.problem
-            tell(f"{_cameras(capture, [camera for camera, _ in group])}: {text}")
+            names = [capture.camera_ids[camera] for camera, _ in group]
+            tell(f"camera{'s' * (len(names) > 1)} {some(names)}: {text}")
     return good
 
 
@@ -365,10 +349,8 @@ def _check_poses(capture: CaptureFolder, report: SubjectReport) -> None:
     if len(poses) > 2 and np.ptp([pose.pose for pose in poses.values()], axis=0).max() < 1e-9:
         still = _masks_stand_still(capture, [frame for frame in frames if not capture.lacks(0, frame)])
         text = f"all {len(poses)} poses looked at are the same"
-        if still:
-            report.warn(f"{text}; right for somebody who stands still, expected a pose for each frame")
-        else:
-            report.problem(f"{text}, but the masks move; expected a pose for each frame")
+        why = "; right for somebody who stands still," if still else ", but the masks move;"
+        (report.warn if still else report.problem)(f"{text}{why} expected a pose for each frame")
 
 
 def _masks_stand_still(capture: CaptureFolder, frames: Sequence[int]) -> bool:
@@ -527,20 +509,8 @@ def _overlap(view: Camera, body: Outline, mask: Mask, camera: int, frame: int) -
         for name, factor in SCALES.items():
             scaled = replace(small, K=np.diag([factor, factor, 1.0]) @ small.K)
             iou[name] = _iou(part, body.drawn(scaled)[1])
-    return Overlap(
-        camera,
-        frame,
-        share_inside(points, grown),
-        _on_body(part, drawn),
-        iou,
-        float(part.mean()),
-        float(np.concatenate([part[0], part[-1], part[:, 0], part[:, -1]]).mean()),
-        float(drawn.mean()),
-        part,
-        drawn,
-        small,
-        body,
-    )
+    inside, on_body = share_inside(points, grown), _on_body(part, drawn)
+    return Overlap(camera, frame, part, drawn, small, body, inside, on_body, iou)
 
 
 def _on_body(mask: Mask, drawn: Mask) -> float:
@@ -605,7 +575,7 @@ def _check_fit(
     lowest_covered, lowest_inside = (0.75, 0.85) if exact else (0.5, 0.7)
     bad = covered < lowest_covered or (whole is True and inside < lowest_inside)
     odd = exact and (covered < 0.9 or (whole is True and inside < 0.95))
-    reasons = [_shift(visible), _size(visible), _wrong_order(capture, visible, outline) if exact else None]
+    reasons = [_shift(visible), _wrong_order(capture, visible, outline) if exact else None]
     if likely := [reason for reason in reasons if reason]:
         gain, text = max(likely)
         bad |= gain > CERTAIN
@@ -682,25 +652,6 @@ def _shift(fits: Sequence[Overlap]) -> tuple[float, str] | None:
     return float(there - before), f"{text}; check cropping and cx, cy"
 
 
-def _size(fits: Sequence[Overlap]) -> tuple[float, str] | None:
-    """How much overlap is to be gained, and the word that the body is drawn too large or small; None elsewhere."""
-    ratios, there = [], []
-    for fit in _evenly([fit for fit in fits if fit.reach is not None], 8):
-        rows, columns = (np.flatnonzero(fit.mask.any(axis)) for axis in (1, 0))
-        ratios.append((fit.reach[0] / (np.ptp(columns) + 1), fit.reach[1] / (np.ptp(rows) + 1)))
-        there.append(fit.fitted())
-    if not ratios:
-        return None
-    x, y = np.median(ratios, axis=0)
-    factor = float(np.sqrt(x * y))
-    there, before = float(np.mean(there)), float(np.mean([fit.iou[""] for fit in fits]))
-    if 0.75 < factor < 1.33 or not 0.6 < x / y < 1.6 or there < 0.5 or before > 0.5:
-        return None
-    relation = f"{factor:.2g} times as large as" if factor > 1 else f"{1 / factor:.2g} times smaller than"
-    text = f"the body is drawn {relation} the masks show it"
-    return there - before, f"{text}; check the focal lengths and the units of t and transl"
-
-
 def _wrong_order(
     capture: CaptureFolder, fits: Sequence[Overlap], outline: Callable[[int], Outline]
 ) -> tuple[float, str] | None:
@@ -722,17 +673,16 @@ def _wrong_order(
         on = float(drawn[fit.mask].mean()) - float(fit.body[fit.mask].mean())
         return min(_iou(fit.mask, drawn) - fit.iou[""], on) if on > 0 else min(0.0, on)
 
-    def gains(other: Callable[[int], int]) -> list[float]:
-        pairs = [(fit, other(fit.frame)) for fit in sampled]
+    def gains(sign: int, start: int) -> list[float]:
+        """With the poses of the frames start + sign · frame."""
+        pairs = [(fit, start + sign * fit.frame) for fit in sampled]
         return [gain(fit, frame) for fit, frame in pairs if 0 <= frame < capture.n_frames and frame != fit.frame]
 
-    def by(steps: int) -> Callable[[int], int]:
-        return lambda frame: frame + steps
-
-    candidates = {f"{k} frame{'s' * (k > 1)} {way}": by(sign * k) for k in SHIFTS for way, sign in WAYS.items()}
-    candidates["the reversed order"] = lambda frame: capture.n_frames - 1 - frame
+    candidates = {f"{k} frame{'s' * (k > 1)} later": (1, k) for k in SHIFTS}
+    candidates |= {f"{k} frame{'s' * (k > 1)} earlier": (1, -k) for k in SHIFTS}
+    candidates["the reversed order"] = -1, capture.n_frames - 1
     try:
-        tried = {name: values for name, other in candidates.items() if len(values := gains(other)) > 2}
+        tried = {name: values for name, order in candidates.items() if len(values := gains(*order)) > 2}
         any_frame = [max((gain(fit, other.frame) for other in own if other is not fit), default=0) for fit in sampled]
     except BadInput:  # named where that frame is looked at
         return None
@@ -759,11 +709,6 @@ def _views(capture: CaptureFolder, views: Sequence[tuple[int, int]]) -> str:
     labels = [capture.label(frame) for _, frame in views]
     named = [f"{capture.camera_ids[c]}/{n}" if several else n for (c, _), n in zip(views, labels, strict=True)]
     return f"frame{'s' * (len(named) > 1)} {some(named)}"
-
-
-def _cameras(capture: CaptureFolder, cameras: Sequence[int]) -> str:
-    names = [capture.camera_ids[camera] for camera in cameras]
-    return f"camera{'s' * (len(names) > 1)} {some(names)}"
 
 
 def some(names: Sequence[str]) -> str:

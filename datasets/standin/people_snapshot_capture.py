@@ -77,7 +77,7 @@ class PeopleSnapshotStandIn(StandIn):
         people_snapshot.write_camera(folder, own)
         people_snapshot.write_masks(folder, masks, masks.shape)
         people_snapshot.write_consensus(folder, subject.betas, subject.offsets)
-        texture = np.rint(np.clip(subject.texture, 0, 1) * 255).astype(np.uint8)
+        texture = np.rint(np.clip(subject.baked[0], 0, 1) * 255).astype(np.uint8)
         atomic.write_bytes(folder / "truth" / "texture.png", encoded(texture, "PNG"))
         pelvis = subject.body.shaped(subject.betas)[1][0]
         people_snapshot.write_poses(folder, [in_camera_space(pose, camera, pelvis) for pose in poses])

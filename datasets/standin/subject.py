@@ -31,7 +31,7 @@ ROUTINES: tuple[tuple[str, ...], ...] = (
 class Subject:
     """Member `number` (from 1) of the cast that `seed` draws. A pure function of (seed, number, body).
 
-    `vertices` are the unclothed body that a fit to the person would give; `clothed_vertices`, `texture` and `labels`
+    `vertices` are the unclothed body that a fit to the person would give; `clothed_vertices` and `baked`
     are the truth that the photographs show and that no file of the capture holds.
     """
 
@@ -94,18 +94,9 @@ class Subject:
         return outfit.stand_off(self.body, self.style)
 
     @cached_property
-    def _baked(self) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    def baked(self) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+        """Over the body's atlas [S, S, 3] sRGB albedo in [0, 1], and [S, S] `outfit.Part`."""
         return outfit.bake(self.body, self.style)
-
-    @property
-    def texture(self) -> NDArray[np.float32]:
-        """[S, S, 3] sRGB albedo in [0, 1] over the body's atlas."""
-        return self._baked[0]
-
-    @property
-    def labels(self) -> NDArray[np.uint8]:
-        """[S, S] `outfit.Part` over the body's atlas."""
-        return self._baked[1]
 
     def vertices(self, frame: int) -> NDArray[np.float64]:
         """[V, 3] m, world: the unclothed body."""
@@ -121,4 +112,4 @@ class Subject:
         camera: Camera,
         background: NDArray[np.uint8],  # [H, W, 3] sRGB, what this camera sees without the person
     ) -> Photograph:
-        return photograph(vertices, self.body, self.texture, self.labels, self.lighting, camera, background)
+        return photograph(vertices, self.body, *self.baked, self.lighting, camera, background)

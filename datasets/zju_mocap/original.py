@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from ihbench.body import Body, from_zju_root, zju_root
 from ihbench.body.pose import BodyPose
-from ihbench.camera import Camera, off_orthogonal
+from ihbench.camera import Camera, check_rotation
 from ihbench.datasets.reading.capture_folder import CaptureFolder
 from ihbench.datasets.reading.pickles import write_object
 from ihbench.datasets.reading.plausibility import Outline
@@ -243,10 +243,8 @@ def _camera_field(cams: dict, key: str, path: Path) -> NDArray[np.float64]:
 
 
 def _check_calibration(cameras: dict[str, NDArray[np.float64]], path: Path) -> None:
-    R = cameras["R"]
-    bad = np.flatnonzero((off_orthogonal(R) > 1e-3) | (np.linalg.det(np.clip(R, -1e3, 1e3)) < 0))
-    if len(bad):
-        raise BadInput(f"{path}: expected rotation matrices in cams['R'], found another matrix for camera {bad[0]}")
+    for number, R in enumerate(cameras["R"]):
+        check_rotation(R, f"{path}: cams['R'] of camera {number}", 1e-3)
     furthest = np.linalg.norm(cameras["T"], axis=1).max()
     if furthest < 100:
         raise BadInput(

@@ -62,23 +62,12 @@ def _match_by_corners(
     faces: NDArray[np.integer], obj_faces: NDArray[np.int32], obj_uv_faces: NDArray[np.int32], path: Path
 ) -> NDArray[np.int32]:
     """uv_faces in the order of `faces`: triangles are the same when their three vertices are."""
-
-    def canonical(triangles: NDArray[np.integer]) -> tuple[NDArray, NDArray]:
-        corner_order = np.argsort(triangles, axis=1)
-        sorted_corners = np.take_along_axis(triangles, corner_order, 1)
-        return corner_order, np.lexsort(sorted_corners.T)
-
-    corner_order, face_order = canonical(faces)
-    obj_corner_order, obj_face_order = canonical(obj_faces)
-    body_keys = np.take_along_axis(faces, corner_order, 1)[face_order]
-    obj_keys = np.take_along_axis(obj_faces, obj_corner_order, 1)[obj_face_order]
-    if body_keys.shape != obj_keys.shape or (body_keys != obj_keys).any():
+    pairs = zip(obj_faces.tolist(), obj_uv_faces.tolist(), strict=True)
+    of_corners = {frozenset(corners): dict(zip(corners, uv_corners, strict=True)) for corners, uv_corners in pairs}
+    triangles = faces.tolist()
+    if len(obj_faces) != len(triangles) or of_corners.keys() != set(map(frozenset, triangles)):
         raise BadInput(
             f"{path}: its {len(obj_faces)} triangles are not the body's {len(faces)}; "
             "give the texture coordinates of this body, or none to have an atlas cut from the mesh"
         )
-    sorted_uv = np.take_along_axis(obj_uv_faces, obj_corner_order, 1)[obj_face_order]
-    out = np.empty_like(obj_uv_faces)
-    rows = face_order[:, None]
-    out[rows, corner_order[face_order]] = sorted_uv
-    return out
+    return np.array([[of_corners[frozenset(face)][vertex] for vertex in face] for face in triangles], np.int32)

@@ -329,7 +329,7 @@ def test_several_scenes_are_named_by_folder_or_file(tmp_path, own_body):
         ("K", [[50, 0, 30], [0, 50, 20], [0, 0, 2]], "fx, fy > 0"),
         ("K", "wide", "expected 'K' to be numbers"),
         ("K", [[50, 0, "nan"], [0, 50, 20], [0, 0, 1]], "NaN"),
-        ("R", [[2, 0, 0], [0, 2, 0], [0, 0, 2]], "rotation matrix"),
+        ("R", [[2, 0, 0], [0, 2, 0], [0, 0, 2]], "expected rotations"),
         ("R", [[1, 0, 0], [0, 1, 0], [0, 0, -1]], "left-handed"),
         ("R", None, "expected 'R' to be numbers"),
         ("t", [[0], [1]], r"'t' to be numbers of shape \[3\], found \[2, 1\]"),

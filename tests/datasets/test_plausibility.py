@@ -163,7 +163,7 @@ PROBLEMS = {
     "one camera twice": (a_second_camera_alike, "cameras main, copy: have one and the same K, R and t"),
     "t in millimetres": (camera(lambda c: c.update(t=[0, 0, 3000])), "millimetres; expected metres, divide by 1000"),
     "transl in centimetres": (poses(transl=lambda t: 100 * t), "centimetres; expected metres, divide by 100"),
-    "transl in decimetres": (poses(transl=lambda t: 10 * t), "drawn 10 times smaller than the masks show it"),
+    "transl in decimetres": (poses(transl=lambda t: 10 * t), "% of the silhouettes lie on the body"),
     "camera in the body": (camera(lambda c: c.update(t=[0, 0, -3.05])), "stands inside the body"),
     "behind": (camera(lambda c: c.update(t=[0, 0, -6.2])), "it is 3 m behind it"),
     "nowhere": (poses(transl=lambda t: t + 1e300), "t or transl look like"),
