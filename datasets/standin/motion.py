@@ -37,6 +37,7 @@ class Performance:
     pose: Array  # [T, 24, 3] rad; the root holds only the sway of the pelvis
     yaw: Array  # [T] rad about the world's z axis; 0 looks along -y
     place: Array  # [T, 2] m, where on the floor the person means to stand
+    exercises: tuple[str, ...]
 
 
 def perform(
@@ -50,7 +51,7 @@ def perform(
     pose = _blend([EXERCISES[name](_phase(rng, n_frames)) for name in exercises])
     pose = pose + _stepping(yaw) + _restlessness(rng, n_frames)
     pose = gaussian_filter1d(pose, 1.5, axis=0, mode="nearest")
-    return Performance(pose, yaw, _drift(rng, n_frames))
+    return Performance(pose, yaw, _drift(rng, n_frames), exercises)
 
 
 def turntable(rng: np.random.Generator, n_frames: int, turns: float) -> Performance:
@@ -66,7 +67,9 @@ def turntable(rng: np.random.Generator, n_frames: int, turns: float) -> Performa
     lift = 12 + 5 * np.sin(phase + rng.uniform(0, 2 * np.pi))
     _turn_both(pose, "shoulder", z=lift)
     pose = pose + _stepping(yaw) + 0.5 * _restlessness(rng, n_frames)
-    return Performance(gaussian_filter1d(pose, 1.5, axis=0, mode="nearest"), yaw, np.zeros((n_frames, 2)))
+    return Performance(
+        gaussian_filter1d(pose, 1.5, axis=0, mode="nearest"), yaw, np.zeros((n_frames, 2)), ("a_pose",)
+    )
 
 
 def stroll(rng: np.random.Generator, n_frames: int, reach: float) -> Performance:
@@ -99,7 +102,7 @@ def stroll(rng: np.random.Generator, n_frames: int, reach: float) -> Performance
     _turn(pose, "spine2", x=10 * out)
     pose = pose + 0.6 * _restlessness(rng, n_frames)
     yaw = side * gaussian_filter1d(heading, 2, mode="nearest")
-    return Performance(gaussian_filter1d(pose, 1.2, axis=0, mode="nearest"), yaw, place)
+    return Performance(gaussian_filter1d(pose, 1.2, axis=0, mode="nearest"), yaw, place, ("walk", "reach"))
 
 
 def body_poses(performance: Performance, betas: Array, body: Body) -> list[BodyPose]:
