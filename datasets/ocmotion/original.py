@@ -34,7 +34,7 @@ from ihbench.datasets.reading.stored_numbers import FARTHEST, check_calibration,
 from ihbench.datasets.reading.subject_folders import SubjectFolders, View, count_files
 from ihbench.errors import BadInput
 from ihbench.files.paths import user_path
-from ihbench.files.pictures import read_mask, size_of
+from ihbench.files.pictures import read_mask
 from ihbench.files.safe_pickle import load_pickle
 from ihbench.scene.copy_report import SubjectReport
 
@@ -97,12 +97,7 @@ class OneCameraCapture(CaptureFolder):
 
     @cached_property
     def _image_size(self) -> tuple[int, int]:
-        if self._annotated_size is not None:
-            return self._annotated_size
-        path = next((path for path in self._images if path.is_file()), None)
-        if path is None:
-            raise BadInput(f"{self._images[0].parent}: no image in it; expected the frames{self.standin_hint}")
-        return size_of(path)
+        return self._annotated_size or self.size_of_first(self._images, 0)
 
 
 class Sequences(SubjectFolders[OneCapture], Generic[OneCapture]):
@@ -135,10 +130,10 @@ class OcMotionOriginal(Sequences["OcMotionCapture"]):
     def __init__(self, root: Path):
         """Raises `BadInput` when there is no annotation file; does not read them."""
         self.root = user_path(root)
-        if not self.root.is_dir():
-            raise BadInput(f"{self.root}: no such folder; give the folder that holds OcMotion's annot/")
         if not self.holds(self.root):
-            raise BadInput(f"{self.root}: no annot/train.pkl or annot/test.pkl in it{_where_else(self.root)}")
+            below = next((path.parent.parent for path in sorted(self.root.glob("*/annot/*.pkl"))), None)
+            where = f"there is one in {below}, give that folder" if below else "expected the original release"
+            raise BadInput(f"{self.root}: no annot/train.pkl or annot/test.pkl in it; {where}")
 
     @staticmethod
     def holds(folder: Path) -> bool:
@@ -286,15 +281,6 @@ def mask_file(img_path: str, suffix: str = "") -> str:
 
 def _without_images(path: PurePosixPath) -> PurePosixPath:
     return PurePosixPath(*path.parts[1:]) if path.parts[:1] == ("images",) else path
-
-
-def _where_else(root: Path) -> str:
-    below = next((path.parent.parent for path in sorted(root.glob("*/annot/*.pkl"))), None)
-    if below is not None:
-        return f"; there is one in {below}, give that folder"
-    if (root / "metadata.json").is_file() or any(root.glob("*/metadata.json")):
-        return "; this looks like `_w2a` sequences (metadata.json), expected the original release"
-    return "; expected the original OcMotion release, unpacked"
 
 
 # ------------------------------------------------------------------------------- checked values of both

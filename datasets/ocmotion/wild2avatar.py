@@ -67,10 +67,6 @@ class OcMotionW2a(Sequences["W2aCapture"]):
         pictures = any((folder / name).is_dir() for name in ("images", "masks"))
         return (named and pictures) or ((folder / METADATA).is_file() and (named or pictures))
 
-    def other_layout(self) -> str:
-        original = any((self.root / "annot").glob("*.pkl"))
-        return "this looks like the original OcMotion release (annot/), " if original else ""
-
     def capture(self, subject: str, body: Body | None) -> W2aCapture:
         return W2aCapture(self._folders[subject], body)
 

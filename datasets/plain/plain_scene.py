@@ -13,7 +13,6 @@ from __future__ import annotations
 import hashlib
 import re
 import unicodedata
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -37,7 +36,7 @@ from ihbench.datasets.reading.subject_folders import SubjectFolders, View
 from ihbench.errors import BadInput, BadValue
 from ihbench.files import atomic
 from ihbench.files.npz import read_npz, write_npz
-from ihbench.files.pictures import one_line, read_mask, read_rgb, write_picture
+from ihbench.files.pictures import read_mask, read_rgb, write_picture
 from ihbench.files.spelling import as_stored, missing_file, same_name
 from ihbench.registry import nearest
 from ihbench.scene.copy_report import SubjectReport
@@ -134,11 +133,7 @@ class PlainCapture(CaptureFolder):
         """body.npz where there is one, else as in other captures. Raises `BadInput`."""
         if self.body != "own":
             return super().model
-        path = as_stored(self.folder / BODY_FILE)
-        try:
-            return replace(load_body(path), name="own")
-        except (zlib.error, NotImplementedError, RuntimeError) as error:
-            raise BadInput(f"{path}: damaged ({one_line(error)}); write the file again") from error
+        return replace(load_body(as_stored(self.folder / BODY_FILE)), name="own")
 
     @property
     def has_model(self) -> bool:

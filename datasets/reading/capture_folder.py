@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +18,7 @@ from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.datasets.reading.standin_mark import standin_mark
 from ihbench.errors import BadInput
-from ihbench.files.pictures import read_rgb
+from ihbench.files.pictures import read_rgb, size_of
 from ihbench.files.spelling import missing_file
 from ihbench.registry import nearest
 
@@ -125,6 +125,16 @@ class CaptureFolder(ABC):
         """(width, height) px of a camera's pictures."""
         view = self.camera(camera)
         return view.width, view.height
+
+    def size_of_first(self, paths: Iterable[Path], camera: int) -> tuple[int, int]:
+        """(width, height) px of the first of a camera's images that is there. Raises `BadInput` where none is."""
+        folder = Path()
+        for path in paths:
+            if path.is_file():
+                return size_of(path)
+            folder = path.parent
+        state = "no image in it" if folder.is_dir() else "no such folder"
+        raise BadInput(f"{folder}: {state}; expected the images of camera {camera}{self.standin_hint}")
 
     size_source = "the camera's images are"  # what says so, for messages
 

@@ -32,8 +32,6 @@ class SubjectFolders(ABC, Generic[Capture]):
     def __init__(self, root: Path):
         """Raises `BadInput` when there is no such folder, nothing of this layout in it, or one name twice."""
         self.root = user_path(root)
-        if not self.root.is_dir():
-            raise BadInput(f"{self.root}: no such folder; give the folder that holds {self.content}")
         itself = self.root.absolute()  # "." may be a subject's folder
         try:
             inside = [itself] if self.holds(itself) else sorted(itself.iterdir())
@@ -45,7 +43,7 @@ class SubjectFolders(ABC, Generic[Capture]):
         if below is not None:
             raise BadInput(f"{nothing}; there is one in {below.parent}, give that folder")
         if not folders:
-            raise BadInput(f"{nothing}; {self.other_layout()}expected {self.content}")
+            raise BadInput(f"{nothing}; expected {self.content}")
         self._folders: dict[str, Path] = {}
         for folder in folders:
             name = self.name_of(folder)
@@ -60,10 +58,6 @@ class SubjectFolders(ABC, Generic[Capture]):
 
     def name_of(self, folder: Path) -> str:
         return folder.name
-
-    def other_layout(self) -> str:
-        """ "this looks like …, " where the folder has a known other layout."""
-        return ""
 
     @abstractmethod
     def capture(self, subject: str, body: Body | None) -> Capture:

@@ -85,10 +85,8 @@ class HumanNerfCapture(CaptureFolder):
             if key in self._names:
                 raise BadInput(f"{folder / 'cameras.pkl'}: frame {key[1]} is there twice; move one of the two away")
             self._names[key] = str(name)
-        ids = sorted({camera for camera, _ in self._names} - {MONOCULAR}, key=int)
-        if any(camera == MONOCULAR for camera, _ in self._names):
-            ids.insert(0, MONOCULAR)
-        self.camera_ids = tuple(ids)
+        ids = {camera for camera, _ in self._names}
+        self.camera_ids = tuple(sorted(ids, key=lambda camera: -1 if camera == MONOCULAR else int(camera)))
         self.n_frames = max(frame for _, frame in self._names) + 1
         self._sizes: dict[int, tuple[int, int]] = {}
         self._fitted_betas: dict[bytes, NDArray[np.float64]] = {}

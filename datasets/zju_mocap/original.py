@@ -32,7 +32,7 @@ from ihbench.datasets.reading.stored_numbers import described, numbers
 from ihbench.datasets.reading.subject_folders import SubjectFolders, View, count_files
 from ihbench.errors import BadInput
 from ihbench.files import atomic
-from ihbench.files.pictures import read_mask, size_of, write_picture
+from ihbench.files.pictures import read_mask, write_picture
 from ihbench.files.safe_pickle import load_npy
 from ihbench.files.spelling import missing_file
 from ihbench.scene.copy_report import SubjectReport
@@ -55,10 +55,6 @@ class ZjuMocap(SubjectFolders["ZjuCapture"]):
 
     def name_of(self, folder: Path) -> str:
         return folder.name.removeprefix(FOLDER_PREFIX)
-
-    def other_layout(self) -> str:
-        repack = any(path.is_dir() for path in self.root.glob("my_[0-9]*"))
-        return "this looks like the ZJU-MoCap-refine repack (my_*), " if repack else ""
 
     def subjects(self) -> list[str]:
         """Names in natural order."""
@@ -184,12 +180,7 @@ class ZjuCapture(CaptureFolder):
         """(width, height) px of the camera's first image on disk."""
         if camera not in self._sizes:
             paths = (self.image_path(camera, frame) for frame in range(self.n_frames))
-            path = next((path for path in paths if path.is_file()), None)
-            if path is None:
-                folder = self.image_path(camera, 0).parent
-                state = "no image in it" if folder.is_dir() else "no such folder"
-                raise BadInput(f"{folder}: {state}; expected the images of camera {camera}{self.standin_hint}")
-            self._sizes[camera] = size_of(path)
+            self._sizes[camera] = self.size_of_first(paths, camera)
         return self._sizes[camera]
 
 

@@ -40,9 +40,6 @@ class ZjuRefine(ZjuMocap):
     def name_of(self, folder: Path) -> str:
         return folder.name.removeprefix(PREFIX)
 
-    def other_layout(self) -> str:
-        return ""
-
     def capture(self, subject: str, body: Body | None) -> ZjuCapture:
         return ZjuRefineCapture(self._folders[subject], body)
 

@@ -375,10 +375,10 @@ def test_standin_takes_its_own_body_and_may_lack_images(sequence):
 
 
 def test_the_layouts_do_not_take_each_others_folders(w2a, original, tmp_path):
-    with pytest.raises(BadInput, match="looks like the original OcMotion release"):
+    with pytest.raises(BadInput, match="no subject of this layout"):
         OcMotionW2a(original.root)
     for root in (w2a.root, w2a.root / NAME):
-        with pytest.raises(BadInput, match="looks like `_w2a` sequences"):
+        with pytest.raises(BadInput, match="expected the original release"):
             OcMotionOriginal(root)
     for layout in (OcMotionW2a, OcMotionOriginal):
         with pytest.raises(BadInput, match="expected"):
