@@ -55,13 +55,9 @@ class AblateOptions(SceneChoice, Report):
 
 
 def main(argv: list[str]) -> int:
-    chosen = options(AblateOptions, argv, "ablate", "What each component of a method is worth.")
-    return _ablate(chosen)
-
-
-def _ablate(chosen: AblateOptions) -> int:
     from ihbench.clock.progress import Progress
 
+    chosen = options(AblateOptions, argv, "ablate", "What each component of a method is worth.")
     if chosen.ladder == "list":
         for name, suite in _suites(chosen.method).items():
             print(f"{name:<12}{len(suite.variants)} rungs: {suite.title}")

@@ -133,13 +133,9 @@ def round_ticks(low: float, high: float, most: int = 7) -> list[float]:
         [1.0],
     ]
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    for ladder in ladders:
-        ticks = [float(f"{m * 10.0**d:.3g}") for d in decades for m in ladder]
+    for ladder, skip in [*((ladder, 1) for ladder in ladders), *(([1.0], skip) for skip in range(2, 40))]:
+        ticks = [float(f"{m * 10.0**d:.3g}") for d in decades if d % skip == 0 for m in ladder]
         ticks = [t for t in ticks if low <= t <= high]
-        if 2 <= len(ticks) <= most:
-            return ticks
-    for skip in range(2, 40):
-        ticks = [10.0**d for d in decades if d % skip == 0 and low <= 10.0**d <= high]
         if 2 <= len(ticks) <= most:
             return ticks
     return sorted({float(f"{low:.2g}"), float(f"{high:.2g}")})
@@ -166,9 +162,9 @@ class Label:
 
 def place_labels(
     axes: Axes, labels: Sequence[Label], lines: Sequence[Sequence[tuple[float, float]]] = (), size: float = 9.0
-) -> int:
+) -> None:
     """Write each text beside its point, where it covers no point, no line through these points and no other text; a
-    thin line leads to it where it had to go further away. Returns how many found no room; the CSV has them."""
+    thin line leads to it where it had to go further away. What finds no room is in the CSV alone."""
     drawn: Any = axes.figure
     settle(drawn)  # only now is it known where points lie in pixels
     scale = drawn.dpi / 72
@@ -183,12 +179,16 @@ def place_labels(
             along = np.linspace(start, end, count + 1)
             taken.append(np.concatenate([along - 2, along + 2], 1))
     boxes = np.concatenate(taken)
-    lost = 0
     for (x, y), label in zip(spots, labels, strict=True):
         if not label.text:
             continue
         width, height = LETTER * size * scale * len(label.text) + 3, 1.1 * size * scale
-        offsets = _offsets(width, height)
+        # lower left corners relative to the point in px, nearest first, and whether a line must lead there
+        offsets = [
+            (x * far + across * width, y * far + up * height, far > 18.0)
+            for far in (9.0, 18.0, 30.0, 45.0, 64.0)
+            for x, across, y, up in PLACES
+        ]
         corner = np.array([(x + dx, y + dy) for dx, dy, _ in offsets])
         candidates = np.concatenate([corner, corner + np.array([width, height])], 1)  # [offsets, 4]
         free = (candidates[:, 0] >= frame.x0) & (candidates[:, 1] >= frame.y0)
@@ -196,7 +196,6 @@ def place_labels(
         apart = (candidates[:, None, :2] >= boxes[None, :, 2:]) | (candidates[:, None, 2:] <= boxes[None, :, :2])
         free &= apart.any(-1).all(-1)
         if not free.any():
-            lost += 1
             continue
         k = int(free.argmax())
         dx, dy, leader = offsets[k]
@@ -206,13 +205,3 @@ def place_labels(
             fontsize=size, color=label.colour, zorder=5,
             arrowprops={"arrowstyle": "-", "color": "#999999", "lw": 0.6} if leader else None,
         )  # fmt: skip
-    return lost
-
-
-def _offsets(width: float, height: float) -> list[tuple[float, float, bool]]:
-    """Lower left corners of a label relative to its point in pixels, nearest first, and whether it needs a line."""
-    return [
-        (x * far + across * width, y * far + up * height, far > 18.0)
-        for far in (9.0, 18.0, 30.0, 45.0, 64.0)
-        for x, across, y, up in PLACES
-    ]

@@ -45,10 +45,10 @@ def test_labels_cover_neither_points_nor_lines_nor_each_other():
     axes.plot(*zip(*points, strict=True), ls="")
     diagram.logarithmic(axes, [1, 3], [1, 3])
     line = [(1.0, 1.0), (3.0, 3.0)]
-    lost = place_labels(axes, [Label(p, f"point {k}") for k, p in enumerate(points)], [line])
+    place_labels(axes, [Label(p, f"point {k}") for k, p in enumerate(points)], [line])
     drawn.canvas.draw()
     boxes = [text.get_window_extent() for text in axes.texts]
-    assert len(boxes) == 9 - lost >= 7
+    assert 7 <= len(boxes) <= 9
     frame = axes.get_window_extent()
     spots = axes.transData.transform([*points, *[(1 + 0.1 * k, 1 + 0.1 * k) for k in range(21)]])
     for k, box in enumerate(boxes):
@@ -57,11 +57,10 @@ def test_labels_cover_neither_points_nor_lines_nor_each_other():
         assert not any(box.x0 < x < box.x1 and box.y0 < y < box.y1 for x, y in spots)
 
 
-def test_what_finds_no_room_is_counted_and_not_written():
+def test_what_finds_no_room_is_not_written():
     _, (axes,) = diagram.figure(width=1.5, height=1.2)
     diagram.logarithmic(axes, [1, 2], [1, 2])
-    lost = place_labels(axes, [Label((1.5, 1.5), "a label that is far too long for it " * 3)])
-    assert lost == 1
+    place_labels(axes, [Label((1.5, 1.5), "a label that is far too long for it " * 3)])
     assert not axes.texts
 
 
