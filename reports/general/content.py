@@ -66,16 +66,13 @@ def score_tables(results: Sequence[RunResult], presets: Sequence[str] = ()) -> l
     for (protocol, digest, profile, data), runs in groups.items():
         headline = runs[0].headline
         title = f"{protocol} ({digest}), {profile} profile, {data}"
-        columns = [i for i in dict.fromkeys(i for r in runs for i in r.rows[r.method]) if _has_a_number(runs, i)]
-        if columns:
-            table = _table(runs, columns, headline, with_metric=True)
-            score_tables.append(replace(table, title=title))
-        for preset in presets:
-            scored = _under(preset, runs)
-            columns = _preset_columns(scored)
+        for preset in ("", *presets):
+            scored = _under(preset, runs) if preset else runs
+            own = dict.fromkeys(i for run in runs for i in run.rows[run.method])
+            columns = _preset_columns(scored) if preset else [i for i in own if _has_a_number(runs, i)]
             if columns:
                 table = _table(scored, columns, headline, with_metric=True)
-                score_tables.append(replace(table, title=f"{title}, {preset}"))
+                score_tables.append(replace(table, title=f"{title}, {preset}" if preset else title))
     if not score_tables:
         raise BadInput("--fragment: no run that is done has a number here; there is no table to write")
     return score_tables
