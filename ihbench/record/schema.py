@@ -335,7 +335,7 @@ def _content(file: Path, largest: int) -> str:
 
 def _parsed(file: Path, text: str, where: str = "") -> Any:
     try:
-        value = json.loads(text, object_pairs_hook=atomic.unique_keys, parse_constant=_refused)
+        value = json.loads(text, object_pairs_hook=atomic.unique_keys, parse_constant=_refused, parse_int=_whole)
         return atomic.decode(value)
     except RecursionError as error:
         raise BadInput(f"{file}{where}: not valid JSON (nested too deeply)") from error
@@ -345,3 +345,9 @@ def _parsed(file: Path, text: str, where: str = "") -> Any:
 
 def _refused(word: str) -> Any:
     raise ValueError(f"{word} is no JSON")
+
+
+def _whole(digits: str) -> int:
+    if not -(2**63) <= (number := int(digits)) < 2**63:
+        raise ValueError("a whole number of more than 64 bits")
+    return number
