@@ -385,8 +385,9 @@ def _damage_named(what: object) -> Iterator[None]:
 def _dataset(file: h5py.File, name: str, path: Path) -> h5py.Dataset:
     import h5py
 
-    dataset = file.get(name)
-    if not isinstance(dataset, h5py.Dataset):
+    own = isinstance(file.get(name, getlink=True), h5py.HardLink)  # a link may lead into other files
+    dataset = file.get(name) if own else None
+    if not isinstance(dataset, h5py.Dataset) or dataset.is_virtual or dataset.external:
         names = ", ".join(sorted(file)) or "nothing"
         raise BadInput(f"{path}: expected a data set {name!r} in it, found {names}; copy the file again")
     return dataset

@@ -497,6 +497,22 @@ def test_hdf5_with_damaged_masks(raw):
     message(error)
 
 
+@pytest.mark.parametrize("kind", ["soft link", "external link", "virtual"])
+def test_hdf5_that_points_elsewhere(raw, kind):
+    path, other = raw / "masks.hdf5", raw / "other.hdf5"
+    path.rename(other)
+    with h5py.File(path, "w") as file:
+        if kind == "virtual":
+            layout = h5py.VirtualLayout((N, HEIGHT, WIDTH), np.uint8)
+            layout[:] = h5py.VirtualSource(other, "masks", (N, HEIGHT, WIDTH))
+            file.create_virtual_dataset("masks", layout)
+        else:
+            file["masks"] = h5py.ExternalLink(other, "masks") if kind == "external link" else h5py.SoftLink("/masks2")
+    with pytest.raises(BadInput, match=r"masks.hdf5: expected a data set 'masks' in it") as error:
+        PeopleSnapshotRaw(raw).open(SUBJECT)
+    message(error)
+
+
 @pytest.mark.parametrize(
     ("name", "changes", "expected"),
     [
