@@ -5,7 +5,8 @@ only build plain Python values and numpy arrays of numbers, text or objects. chu
 old SMPL files hold, come back as inert `ForeignObject`s that carry their state.
 
 Memory is bounded by the file's size: nothing is allocated that the file does not hold, and bytes that are copied
-again and again are counted. A file that is made to be slow, or to nest deeply, can still be that.
+again and again are counted, and tuples nest only so deep: hashing one goes down all of it, in C. A file that is made
+to be slow can still be that.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from ihbench.errors import BadInput
 from ihbench.files.regular import opened
 
 LARGEST = 4 * 2**30  # bytes of a file
+DEEPEST = 1000  # tuple in a tuple
 GROWTH = 64  # bytes copied for each byte of a file, at most: honest files share little, and stay far below
 
 
@@ -138,6 +140,7 @@ _ALLOWED: dict[tuple[str, str], Callable] = {
 }
 _INERT_PACKAGES = ("chumpy", "scipy.sparse")
 _LEAVES = (str, bytes, bytearray, int, float, complex, type(None), np.generic)
+_TUPLES = (pickle.TUPLE, pickle.TUPLE1, pickle.TUPLE2, pickle.TUPLE3)
 _REFUSED = (pickle.EXT1, pickle.EXT2, pickle.EXT4, pickle.NEWOBJ_EX)  # no data file needs these
 
 
@@ -167,6 +170,19 @@ class _Allowed:
         raise pickle.UnpicklingError("refused to change a function")
 
 
+def _shallow(load: Callable[[Any], None]) -> Callable[[Any], None]:
+    """An opcode that makes a tuple, of no more than `DEEPEST` others in each other."""
+
+    def loaded(self: Any) -> None:
+        load(self)
+        made, depth = self.stack[-1], self._depth
+        depth[id(made)] = 1 + max((depth.get(id(part), 0) for part in made if type(part) is tuple), default=0)
+        if depth[id(made)] > DEEPEST:
+            raise pickle.UnpicklingError("refused: tuples nested too deeply")
+
+    return loaded
+
+
 _UNFINISHED: Any = object()
 
 
@@ -174,12 +190,15 @@ class SafeUnpickler(pickle._Unpickler):  # in Python: it allocates nothing that 
     """An unpickler that can only build plain values, numpy arrays and `ForeignObject`s."""
 
     dispatch: ClassVar = {
-        code: load for code, load in pickle._Unpickler.dispatch.items() if bytes([code]) not in _REFUSED
+        code: _shallow(load) if bytes([code]) in _TUPLES else load
+        for code, load in pickle._Unpickler.dispatch.items()
+        if bytes([code]) not in _REFUSED
     }
 
     def __init__(self, data: bytes):
         super().__init__(io.BytesIO(data), encoding="latin1")  # maps the bytes of python-2 strings one to one
         self._bytes = 2**20 + GROWTH * len(data)
+        self._depth: dict[int, int] = {}  # by id of a tuple; one that takes a freed one's id takes its place here
         self._foreign: dict[tuple[str, str], type] = {}
         # id -> (original, result), so that a value shared in many places is visited once; the original is there to
         # keep its id taken

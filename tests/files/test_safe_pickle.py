@@ -131,3 +131,13 @@ def test_npy_of_numbers_reads_like_numpy(array, tmp_path):
     value = load_npy(file)
     np.testing.assert_array_equal(value, array)
     assert value.dtype == array.dtype
+
+
+def test_tuples_nested_so_deeply_that_hashing_one_would_end_the_process(tmp_path):
+    path = tmp_path / "deep.pkl"
+    path.write_bytes(b"\x80\x02})" + 1_000_000 * pickle.TUPLE1 + b"K\x01s.")
+    with pytest.raises(BadInput, match="tuples nested too deeply"):
+        load_pickle(path)
+    path.write_bytes(b"\x80\x02})" + 900 * pickle.TUPLE1 + b"K\x01s.")
+    with pytest.raises(BadInput, match="key that is not plain"):
+        load_pickle(path)
