@@ -106,13 +106,11 @@ def _regions(scorer: Scorer, *names: str) -> Iterator[list[NDArray[np.int64]]]:
 
 
 def _not_opened(words: str, change: Mapping[str, object], **of_capture: Any) -> Answer:
-    """Why a scene cannot be made of a changed capture under a changed protocol."""
     capture, protocol = replace(person(), **of_capture), replaced(protocol_with(), change)
     return Answer(words_of(BadInput, lambda: open_scene(capture, protocol)), words)
 
 
 def _nobody_to_score() -> Answer:
-    """Frames without a person: the regions are empty, and their scores absent with a reason."""
     scores = _scores(_scorer(replace(person(), edit_silhouette=empty), rule="none"))
     return Answer(scores["psnr/pooled/range1/body/v1"].reason, "empty region")
 
@@ -133,7 +131,6 @@ def _all_hidden_regions() -> Answer:
 
 
 def _hidden_share(fraction: float) -> Answer:
-    """The strip for all of the person hides all of it, that for none nothing."""
     protocol = replaced(protocol_with(), {"occlusion.fraction": fraction})
     return Answer(apply_rule(protocol, person()).hidden_share(), fraction)
 
@@ -145,7 +142,6 @@ def _one_frame() -> Answer:
 
 
 def _short_capture() -> Answer:
-    """`data check` says it without opening a picture."""
     return Answer(fitness(person(), small_protocol(n_frames=FRAMES + 1)), "has 5 frames, needs frame 5")
 
 
@@ -208,14 +204,12 @@ def _sized(size: int) -> Answer:
 
 
 def _truth(change: Callable[[NDArray], NDArray]) -> Answer:
-    """The truth, in any form that 8 bits can hold, has no error."""
     values = {name: score.value for name, score in _scores(usual(), change).items() if not score.absent}
     perfect = {"psnr": math.inf, "ssim": 1.0, "flip": 0.0}
     return Answer(list(values.values()), [perfect[name.split("/")[0]] for name in values])
 
 
 def _prediction(image: Callable[[NDArray], NDArray | None], words: str) -> Answer:
-    """Why a prediction has no score."""
     try:
         return Answer(_scores(usual(), image)[PSNR_FULL].reason, words)
     except BadInput as error:
@@ -236,7 +230,6 @@ def _nan_elsewhere() -> Answer:
 
 
 def _no_color() -> Answer:
-    """Calibration rows of a scene in which nobody was ever visible are finite."""
     scorer = _scorer(person(), strip=EVERYTHING)
     calibration = Calibration.build(replace(scorer.scene.training, views=_covered(scorer.scene)))
     view = scorer.load(0).view
@@ -289,7 +282,6 @@ def _json_round_trip() -> Answer:
 
 
 def _damaged_state(cut: int) -> Answer:
-    """A checkpoint that lost its end counts as absent, and an event says so."""
     with TemporaryDirectory() as folder:
         ledger = Ledger(Path(folder))
         ledger.save_state("stage", {"x": np.arange(100.0)}, {"step": 3})

@@ -32,7 +32,7 @@ FLOAT32 = "depth and barycentrics are stored in float32"
 
 
 def about_z(angle: float) -> NDArray[np.float64]:
-    """[3, 3] by the library's sine and cosine, and 1 - cos without cancellation where it is written out."""
+    """[3, 3] by the library's sine and cosine."""
     c, s = math.cos(angle), math.sin(angle)
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
 
@@ -56,19 +56,11 @@ def _rotations(rotation: NDArray) -> NDArray[np.float64]:
 
 def _turn(angle: float) -> Answer:
     """Both twins about z, in ulps of 1. A relative change of the vector moves the matrix |angle| times as much."""
-    size = abs(angle)
-    return Answer(_rotations(np.array([0, 0, angle])), about_z(angle), size, scale=max(1.0, size))
-
-
-def _small_sine(angle: float) -> Answer:
-    """The entry sin(angle), in ulps of itself: nothing may be lost to 1."""
-    return Answer(_rotations(np.array([0, 0, angle]))[:, 1, 0], math.sin(angle), 1.0)
+    return Answer(_rotations(np.array([0, 0, angle])), about_z(angle), abs(angle), scale=max(1.0, abs(angle)))
 
 
 def _orthonormal() -> Answer:
-    """R Rᵀ = I for 400 axes at angles from 1e-9 to 30."""
-    rng = np.random.default_rng(0)
-    axes = rng.normal(size=(400, 3))
+    axes = np.random.default_rng(0).normal(size=(400, 3))
     axes *= (np.geomspace(1e-9, 30, 400) / np.linalg.norm(axes, axis=1))[:, None]
     got = _rotations(axes)
     return Answer(got @ got.swapaxes(-1, -2), np.eye(3), scale=1.0)
@@ -83,49 +75,38 @@ def _gradient(angle: float) -> Answer:
     v = torch.tensor([0.0, 0.0, angle], dtype=torch.float64)
     jacobian: Any = torch.autograd.functional.jacobian(axis_angle_to_matrix, v)
     c, s = math.cos(angle), math.sin(angle)
-    expected = np.array([[-s, -c, 0], [c, -s, 0], [0, 0, 0]])
-    along_x = np.array([[0, 0, (1 - c) / angle if angle else 0], [0, 0, -s / angle if angle else -1.0]])
-    got = jacobian.numpy()
-    return Answer(
-        np.concatenate([got[..., 2].ravel(), got[:2, :, 0].ravel()]),
-        np.concatenate([expected.ravel(), along_x.ravel()]), max(1.0, angle), scale=max(1.0, angle),
-    )  # fmt: skip
+    along_z = [-s, -c, 0, c, -s, 0, 0, 0, 0]
+    along_x = [0, 0, (1 - c) / angle if angle else 0, 0, 0, -s / angle if angle else -1.0]
+    got = np.concatenate([jacobian[..., 2].numpy().ravel(), jacobian[:2, :, 0].numpy().ravel()])
+    return Answer(got, along_z + along_x, max(1.0, angle), scale=max(1.0, angle))
 
 
 def _chain(angle: float) -> Answer:
     """Every joint turned as far: the world rotations stay rotations."""
     pose = np.zeros((24, 3))
     pose[:, 0] = angle
-    transforms = skinning_numpy.joint_transforms(pose, load_body().joints, PARENTS)
-    rotation = transforms[:, :3, :3]
+    rotation = skinning_numpy.joint_transforms(pose, load_body().joints, PARENTS)[:, :3, :3]
     return Answer(rotation @ rotation.swapaxes(-1, -2), np.eye(3), 24 * abs(angle), scale=1.0)
 
 
 def _opposing(short_of: float) -> Answer:
     """Two joints turned apart by 180° about z: the even blend is singular, and points collapse on the axis."""
     half = math.pi / 2 - short_of / 2
-    transforms = np.tile(np.eye(4), (24, 1, 1))
-    transforms[0, :3, :3] = skinning_numpy.axis_angle_to_matrix(np.array([0, 0, half]))
-    transforms[1, :3, :3] = skinning_numpy.axis_angle_to_matrix(np.array([0, 0, -half]))
-    weights = np.zeros((1, 24))
-    weights[0, :2] = 0.5
-    point = np.array([[0.3, -0.2, 0.7]])
+    transforms, weights = np.tile(np.eye(4), (24, 1, 1)), np.zeros((1, 24))
+    for joint, angle in enumerate((half, -half)):
+        transforms[joint, :3, :3] = skinning_numpy.axis_angle_to_matrix(np.array([0, 0, angle]))
+        weights[0, joint] = 0.5
+    moved = skinning_numpy.lbs(np.array([[0.3, -0.2, 0.7]]), weights, transforms)[0]
     left = math.cos(half)  # what the blend leaves of lengths across the axis
-    moved = skinning_numpy.lbs(point, weights, transforms)[0]
-    condition = math.inf if short_of == 0 else 1 / left
-    return Answer(moved, [0.3 * left, -0.2 * left, 0.7], condition, scale=1.0)
+    return Answer(moved, [0.3 * left, -0.2 * left, 0.7], math.inf if short_of == 0 else 1 / left, scale=1.0)
 
 
 def _zju_root(angle: float) -> Answer:
-    """To ZJU-MoCap's root convention and back."""
-    pose = np.zeros((24, 3))
+    pose, body = np.zeros((24, 3)), load_body()
     pose[0] = angle * np.array([0.6, 0.8, 0])
     given = BodyPose(pose, np.zeros(10), np.array([1.0, -2.0, 300.0]))
-    body = load_body()
     back = from_zju_root(np.zeros(72), given.betas, *zju_root(given, body), body)
-    return Answer(
-        np.vstack([back.pose[:1], back.transl[None]]), np.vstack([pose[:1], given.transl[None]]), scale=300.0
-    )
+    return Answer([back.pose[0], back.transl], [pose[0], given.transl], scale=300.0)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -144,17 +125,14 @@ def _extreme_betas(size: float) -> Answer:
 
 
 def _surplus_betas() -> Answer:
-    body = load_body()
-    count = body.shapedirs.shape[2] + 1
-    return Answer(words_of(BadInput, lambda: body.shaped(np.ones(count))), f"has {count - 1} shape coefficients")
+    known = load_body().shapedirs.shape[2]
+    words = words_of(BadInput, lambda: load_body().shaped(np.ones(known + 1)))
+    return Answer(words, f"has {known} shape coefficients")
 
 
 def _nan_pose() -> Answer:
-    """A pose of NaN is drawn nowhere, and nothing fails."""
-    body = load_body()
-    pose = BodyPose(np.full((24, 3), math.nan), np.zeros(10), np.zeros(3))
-    camera = front_camera()
-    return Answer(int(rasterize(camera.project(body.pose(pose)), body.faces, 32, 32).mask.sum()), 0)
+    vertices = load_body().pose(BodyPose(np.full((24, 3), math.nan), np.zeros(10), np.zeros(3)))
+    return Answer(int(_drawn(front_camera().project(vertices)[load_body().faces]).mask.sum()), 0)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -176,12 +154,7 @@ BIG = [[-100, -100, 2], [300, -100, 2], [-100, 300, 2]]  # covers a 32² image
 
 
 def _pixels(triangle: Any, expected: int) -> Answer:
-    """How many pixels both back ends draw."""
     return Answer([int(_drawn([triangle], backend).mask.sum()) for backend in ("numpy", "numba")], expected)
-
-
-def _at_near(z: float, drawn: bool) -> Answer:
-    return _pixels([[x, y, z if k == 0 else 2.0] for k, (x, y, _) in enumerate(BIG)], 32 * 32 if drawn else 0)
 
 
 def _sliver(width: float) -> Answer:
@@ -199,9 +172,8 @@ def _sliver(width: float) -> Answer:
 
 
 def _shared_edge() -> Answer:
-    """Two triangles share a diagonal through pixel centres: no crack, and each such pixel has one owner."""
-    square = [[[0, 0, 2], [32, 0, 2], [32, 32, 2]], [[0, 0, 2], [32, 32, 2], [0, 32, 2]]]
-    raster = _drawn(square)
+    """Two triangles share a diagonal: no crack, and each of its pixels has one owner."""
+    raster = _drawn([[[0, 0, 2], [32, 0, 2], [32, 32, 2]], [[0, 0, 2], [32, 32, 2], [0, 32, 2]]])
     return Answer([int(raster.mask.sum()), int((raster.face.diagonal() == 0).sum())], [32 * 32, 32])
 
 
@@ -227,14 +199,12 @@ def _texel_coordinates() -> Answer:
     texels = texel_table(body, 128)
     corners = body.uv[body.uv_faces[texels.face]]
     e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    area = np.abs(e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0])
     longest = np.maximum(np.square(e1).sum(1), np.square(e2).sum(1))
-    got = np.einsum("nk,nkc->nc", texels.bary, corners)
-    return Answer(got, texels.uv, float((longest / area).max()), scale=1.0)
+    condition = float((longest / np.abs(e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0])).max())
+    return Answer(np.einsum("nk,nkc->nc", texels.bary, corners), texels.uv, condition, scale=1.0)
 
 
 def _constant_map() -> Answer:
-    """A map of one value has it everywhere, at the seams and beyond the edge of the unit square."""
     uv = np.array([[0, 0], [1, 1], [0, 1], [-3, 7], [0.5, 0.5], [1 / 3, 1e-300], [1 - 1e-16, 0.999999]])
     return Answer([sample_uv(np.full((r, r, 1), 0.7), uv)[:, 0] for r in (1, 2, 64)], 0.7)
 
@@ -249,23 +219,15 @@ def _projected(camera: Camera, point: tuple[float, float, float]) -> Answer:
     c = R @ p + t
     u, v = (K[0, 0] * c[0] + K[0, 1] * c[1]) / c[2] + K[0, 2], K[1, 1] * c[1] / c[2] + K[1, 2]
     terms = np.abs(camera.R * np.asarray(point)).sum(1) + np.abs(camera.t)
-    sizes = np.abs(np.array([float(x) for x in c]))
-    condition = float((terms / np.maximum(sizes, 1e-300)).max())
-    got = camera.project(np.array(point))
-    exact = np.array([float(u), float(v), float(c[2])])
+    condition = float((terms / np.maximum(np.abs(c.astype(float)), 1e-300)).max())
     # every ratio carries the condition number of the sum it divides by
-    pixels = max(abs(float(u - K[0, 2])), abs(float(v - K[1, 2])), abs(float(u)), abs(float(v)))
-    return Answer(got / [pixels, pixels, sizes[2]], exact / [pixels, pixels, sizes[2]], condition, scale=condition)
-
-
-def _long_lens() -> Answer:
-    K = np.array([[1e5, 0.5, 512], [0, 1e5, 512], [0, 0, 1]])
-    camera = Camera(K, np.eye(3), np.array([0.1, -0.2, 150]), 1024, 1024)
-    return _projected(camera, (0.3, 0.9, 0.25))
+    pixels = max(abs(float(x)) for x in (u - K[0, 2], v - K[1, 2], u, v))
+    sizes = np.array([pixels, pixels, abs(float(c[2]))])
+    exact = np.array([float(u), float(v), float(c[2])])
+    return Answer(camera.project(np.array(point)) / sizes, exact / sizes, condition, scale=condition)
 
 
 def _far_world() -> Answer:
-    """The studio lies a thousand kilometres from the world's origin."""
     K = np.array([[500.0, 0, 256], [0, 500, 256], [0, 0, 1]])
     R, _ = look_at(np.array([0.0, 0.0, 3.0]), np.zeros(3))
     return _projected(Camera(K, R, np.array([0.1, 1e6, 1e6 + 3]), 512, 512),
@@ -273,50 +235,44 @@ def _far_world() -> Answer:
 
 
 def _on_the_plane() -> Answer:
-    """Depth 0 has no pixel, and says so without a warning."""
+    """They have no pixel, and say so without a warning."""
     p = front_camera().project(np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 0.0]]))
     return Answer([bool(np.isfinite(p[:, :2]).any()), *p[:, 2]], [0, 0, 0])
 
 
 def _behind() -> Answer:
-    """The depth tells; nothing of a triangle behind the camera is drawn."""
-    camera = front_camera()
-    p = camera.project(np.array([[-1, -1, -2.0], [1, -1, -2.0], [0, 2, -2.0]]))
-    return Answer([int(rasterize(p, np.array([[0, 1, 2]]), 32, 32).mask.sum()), *p[:, 2]], [0, -2, -2, -2])
+    """The depth tells; nothing is drawn."""
+    p = front_camera().project(np.array([[-1, -1, -2.0], [1, -1, -2.0], [0, 2, -2.0]]))
+    return Answer([int(_drawn(p).mask.sum()), *p[:, 2]], [0, -2, -2, -2])
 
 
 def _strong_lens() -> Answer:
-    """Distortion far off the axis, where terms of the sixth power rule."""
-    coefficients = [-0.24, 0.08, 2e-3, -1.5e-3, 0.01]
-    x, y = 3.0, -4.0
+    """Terms of the sixth power rule."""
+    coefficients, x, y = [-0.24, 0.08, 2e-3, -1.5e-3, 0.01], 3.0, -4.0
     k1, k2, p1, p2, k3, fx, fy = (Fraction(v) for v in (*coefficients, x, y))
     r2 = fx * fx + fy * fy
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    exact = (
-        fx * radial + 2 * p1 * fx * fy + p2 * (r2 + 2 * fx * fx),
-        fy * radial + p1 * (r2 + 2 * fy * fy) + 2 * p2 * fx * fy,
-    )
-    got = distort(np.array(x), np.array(y), np.array(coefficients))
-    size = abs(float(fx)) * (1 + 25 * (0.24 + 25 * (0.08 + 25 * 0.01)))
-    return Answer(got, [float(e) for e in exact], size / abs(float(exact[0])), scale=size)
+    exact = [
+        float(fx * radial + 2 * p1 * fx * fy + p2 * (r2 + 2 * fx * fx)),
+        float(fy * radial + p1 * (r2 + 2 * fy * fy) + 2 * p2 * fx * fy),
+    ]
+    size = x * (1 + 25 * (0.24 + 25 * (0.08 + 25 * 0.01)))
+    return Answer(distort(np.array(x), np.array(y), np.array(coefficients)), exact, size / abs(exact[0]), scale=size)
 
 
 def _resampled() -> Answer:
-    """Half the size, half the pixel: exactly."""
     camera = Camera(np.array([[1e5, 0, 511.7], [0, 1e5, 300.1], [0, 0, 1]]), np.eye(3), np.zeros(3), 1024, 768)
     points = np.random.default_rng(0).uniform(1, 2, (50, 3))
     return Answer(camera.scaled(512, 384).project(points)[:, :2], camera.project(points)[:, :2] / 2)
 
 
 def _wrist_twist() -> Answer:
-    """A wrist turned by 180°: vertices of the forearm move towards the bone, no farther than it is thick."""
-    body = load_body()
-    pose = np.zeros((24, 3))
-    joint = JOINT_INDEX["left_wrist"]
+    """Vertices of the forearm move towards the bone, no farther than it is thick."""
+    body, pose, joint = load_body(), np.zeros((24, 3)), JOINT_INDEX["left_wrist"]
     bone = body.joints[joint] - body.joints[PARENTS[joint]]
     pose[joint] = math.pi * bone / np.linalg.norm(bone)
-    moved = body.pose(BodyPose(pose, np.zeros(10), np.zeros(3)), blend_shapes=False)
     axis = bone / np.linalg.norm(bone)
+    moved = body.pose(BodyPose(pose, np.zeros(10), np.zeros(3)), blend_shapes=False)
 
     def distance(points: NDArray) -> NDArray:
         offset = points - body.joints[joint]
@@ -345,7 +301,8 @@ CASES = [
         for name, angle in ANGLES.items()
     ),
     *(
-        _geometry(f"rotation-sine-{angle:g}", f"the sine of a turn by {angle:g} rad", partial(_small_sine, angle),
+        _geometry(f"rotation-sine-{angle:g}", f"the sine of a turn by {angle:g} rad",
+                  lambda angle=angle: Answer(_rotations(np.array([0, 0, angle]))[:, 1, 0], math.sin(angle), 1.0),
                   "ulp", 2, "two or three roundings of a number that has lost nothing to 1", known=known)
         for angle, known in (
             (1e-300, "the numpy twin squares the vector, which is 0 below 1e-162: the turn is then none at all"),
@@ -387,9 +344,10 @@ CASES = [
     _exact("triangle-no-area", "three corners on a line", partial(_pixels, [[0, 0, 2], [16, 16, 2], [32, 32, 2]], 0)),
     _exact("triangle-nan", "a corner of NaN", partial(_pixels, [[math.nan, 0, 2], *BIG[1:]], 0)),
     _exact("triangle-inf", "a corner at infinity", partial(_pixels, [[math.inf, 0, 2], *BIG[1:]], 0)),
-    _exact("triangle-on-near", "a corner on the near plane", partial(_at_near, NEAR, True)),
+    _exact("triangle-on-near", "a corner on the near plane",
+           partial(_pixels, [[-100, -100, NEAR], *BIG[1:]], 32 * 32)),
     _exact("triangle-behind-near", "a corner just behind the near plane",
-           partial(_at_near, float(np.nextafter(NEAR, 0)), False)),
+           partial(_pixels, [[-100, -100, float(np.nextafter(NEAR, 0))], *BIG[1:]], 0)),
     _geometry("triangle-sliver", "2e-9 px across, 64 px along", partial(_sliver, 1e-9), "ulp", 1, FLOAT32),
     _geometry("triangle-huge", "corners 1e9 px away",
               lambda: Answer(_drawn([[[-1e9, -1e9, 2.5], [3e9, -1e9, 2.5], [-1e9, 3e9, 2.5]]]).depth, 2.5,
@@ -411,7 +369,9 @@ CASES = [
               "weights that sum to 1 within an ulp"),
     _exact("uv-empty-atlas", "padding of charts that are not there",
            lambda: Answer(chart_padding(np.zeros((8, 8), np.bool_), 3), -1)),
-    _camera("camera-focal-1e5", "a focal length of 1e5 px at 150 m", _long_lens),
+    _camera("camera-focal-1e5", "a focal length of 1e5 px at 150 m",
+            partial(_projected, Camera(np.array([[1e5, 0.5, 512], [0, 1e5, 512], [0, 0, 1]]), np.eye(3),
+                                       np.array([0.1, -0.2, 150]), 1024, 1024), (0.3, 0.9, 0.25))),
     _camera("camera-far-world", "a studio 1000 km from the origin", _far_world),
     _camera("camera-grazing", "a point 1 µm before the camera plane",
             partial(_projected, front_camera(500.0), (1e-7, -2e-7, 1e-6))),

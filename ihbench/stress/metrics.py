@@ -72,7 +72,6 @@ def condition_of_ssim(x: NDArray, y: NDArray) -> float:
 
 
 def _one_step(dtype: type) -> Answer:
-    """One value of one pixel moves to the neighbouring number of its type."""
     truth = flat(0.5, dtype=dtype) if dtype != np.uint8 else flat(128, dtype=dtype)
     pred = truth.copy()
     pred[3, 4, 1] = 129 if dtype == np.uint8 else np.nextafter(truth[3, 4, 1], dtype(1))
@@ -132,7 +131,6 @@ def _bad_inside(metric: str, bad: float) -> Answer:
 
 
 def _bad_outside(metric: str, bad: float) -> Answer:
-    """The score is the clean image's to the bit: nothing outside a region leaks in."""
     x, y, mask = texture(1), texture(2), rectangle(slice(8, 20), slice(6, 18))
     clean = METRICS[metric](x, y, mask)
     x = x.copy()
@@ -150,7 +148,6 @@ def _tiny_on_large(amplitude: float) -> tuple[NDArray, NDArray]:
 
 
 def _tiny_difference() -> Answer:
-    """Every pixel off by 2^-40 on a mean of 1: exact in float64, all digits cancel."""
     x, y = flat(1 - 2.0**-40), flat(1)
     return Answer(psnr(x, y), 800 * math.log10(2), condition_of_psnr(x, y))
 
@@ -167,7 +164,6 @@ def _training_ssim() -> Answer:
 
 
 def _training_ssim_gradient() -> Answer:
-    """Both images equal and constant: SSIM is at its top, its gradient is 0 and not 0/0."""
     import torch
 
     from ihbench.metrics.ssim_torch import ssim_map_torch
@@ -179,7 +175,6 @@ def _training_ssim_gradient() -> Answer:
 
 
 def _half_precision(metric: str, name: str) -> Answer:
-    """Rounded to half precision first, then as exact as ever."""
     import torch
 
     images: list[Any] = [torch.from_numpy(texture(seed).copy()).to(getattr(torch, name)) for seed in (1, 2)]
@@ -188,7 +183,6 @@ def _half_precision(metric: str, name: str) -> Answer:
 
 
 def _negative_ssim() -> Answer:
-    """A checkerboard against its negative."""
     board = (np.indices((20, 18)).sum(0) % 2)[..., None].repeat(3, 2).astype(np.float64)
     answer = _against_oracle("ssim", board, 1 - board)
     assert answer.expected < -0.9

@@ -171,7 +171,6 @@ def _threads() -> Answer:
 
 
 def _half() -> Answer:
-    """The picture of the rounded inputs, in float16."""
     scene = [x.astype(np.float16) for x in _cloud(60)]
     return Answer(draw(scene, dtype="float16"), draw(scene))
 

@@ -81,8 +81,8 @@ def fresh(config: InpaintHumanConfig) -> GaussianAvatar:
     return GaussianAvatar(config, the_body(), np.zeros(10), 0)
 
 
-def scaled_rates(factor: float, **changes: Any) -> InpaintHumanConfig:
-    config = replace(TINY, **changes)
+def scaled_rates(factor: float) -> InpaintHumanConfig:
+    config = replace(TINY)
     for name in RATES:  # past the switches' bounds: the guard of a fit must hold whatever reaches it
         object.__setattr__(config, name, factor * getattr(TINY, name))
     return config
@@ -90,13 +90,13 @@ def scaled_rates(factor: float, **changes: Any) -> InpaintHumanConfig:
 
 def fitted(
     config: InpaintHumanConfig,
-    training: TrainingSet,
+    training: TrainingSet | None = None,
     avatar: GaussianAvatar | None = None,
     prepare: Callable[[Stage1], None] = lambda stage: None,
 ) -> tuple[GaussianAvatar | None, str]:
-    """The avatar after stage 1, None where it diverged, and what happened on the way."""
+    """The avatar after stage 1 (on all views by default), None where it diverged, and what happened on the way."""
     ledger, avatar = Ledger(), avatar or fresh(config)
-    stage = Stage1(avatar, training, 0, ledger)
+    stage = Stage1(avatar, training or training_set(), 0, ledger)
     prepare(stage)
 
     def fit() -> GaussianAvatar:
@@ -108,13 +108,16 @@ def fitted(
 
 def _ratio(
     config: InpaintHumanConfig,
-    training: TrainingSet,
-    start: GaussianAvatar | None = None,
+    training: TrainingSet | None = None,
+    start: float | None = None,  # of the decoder's scales, see `with_scale`
     prepare: Callable[[Stage1], None] = lambda stage: None,
 ) -> Answer:
     """Loss after over loss before."""
-    before = mean_loss(start or fresh(config), training)
-    after, story = fitted(config, training, start, prepare)
+    training, avatar = training or training_set(), fresh(config)
+    if start is not None:
+        with_scale(avatar, start)
+    before = mean_loss(avatar, training)
+    after, story = fitted(config, training, avatar, prepare)
     return Answer(math.nan if after is None else mean_loss(after, training) / before, 1.0, note=story)
 
 
@@ -130,7 +133,7 @@ def with_scale(avatar: GaussianAvatar, raw: float) -> GaussianAvatar:
 
 def _absurd_rates() -> Answer:
     """1e30 times too large: nothing can be saved, and the record says so."""
-    after, story = fitted(scaled_rates(1e30), training_set())
+    after, story = fitted(scaled_rates(1e30))
     assert after is None
     return Answer(story, "diverged, first bad step 1: loss is nan")
 
@@ -149,7 +152,7 @@ def _last_step() -> Answer:
 
         stage.optimizer.step = spoiled
 
-    after, story = fitted(TINY, training_set(), prepare=spoil)
+    after, story = fitted(TINY, prepare=spoil)
     finite = after is not None and all(bool(p.isfinite().all()) for p in after.parameters())
     return Answer(f"finite {finite}: {story}", f"finite True: step {STEPS} rejected, back to 0")
 
@@ -161,16 +164,7 @@ def _clipped(factor: float) -> Answer:
         loss = stage._loss
         stage._loss = lambda k: factor * loss(k)
 
-    return _ratio(replace(TINY, clip_gradient=1e30), training_set(), prepare=scale)
-
-
-# ----------------------------------------------------------------------------------------------------
-# Scales
-
-
-def _scales(raw: float) -> Answer:
-    """A fit from Gaussians whose scale factor is e^raw, against the loss that it began with."""
-    return _ratio(TINY, training_set(), with_scale(fresh(TINY), raw))
+    return _ratio(replace(TINY, clip_gradient=1e30), prepare=scale)
 
 
 def _dead_scales(raw: float) -> Answer:
@@ -197,49 +191,33 @@ def _bounded_scales() -> Answer:
 def _contradiction() -> Answer:
     """Every view once as it is, and once with person and background exchanged: there is no right answer, so the loss
     cannot fall by much; it must not rise, nor end in NaN."""
-    swapped = []
-    for view in views():
-        mask = view.mask.copy()
-        mask[view.mask == MaskState.PERSON] = MaskState.BACKGROUND
-        mask[view.mask == MaskState.BACKGROUND] = MaskState.PERSON
-        swapped.append(replace(view, mask=mask))
-    return _ratio(TINY, training_set([*views(), *swapped]))
+    states = np.array([MaskState.PERSON, MaskState.BACKGROUND, MaskState.UNKNOWN], np.uint8)  # of the states in order
+    return _ratio(TINY, training_set([*views(), *(replace(view, mask=states[view.mask]) for view in views())]))
 
 
-def _wrong_pose() -> Answer:
-    """One frame in six has the pose of another."""
-    return _ratio(TINY, with_view(2, body_pose=views()[5].body_pose))
-
-
-def _one_pixel() -> Answer:
-    """One visible pixel in all."""
-    mask = np.full_like(views()[0].mask, MaskState.UNKNOWN)
-    mask[a_person_pixel(0)] = MaskState.PERSON
-    return _ratio(TINY, training_set([replace(views()[0], mask=mask)]))
+def only_a_pixel(k: int, elsewhere: MaskState) -> TrainView:
+    """View k with one person pixel."""
+    mask = np.full_like(views()[k].mask, elsewhere)
+    mask[a_person_pixel(k)] = MaskState.PERSON
+    return replace(views()[k], mask=mask)
 
 
 def _speck() -> Answer:
-    """A view that shows one pixel of the person and all of the background costs a hundred times what others do; the
-    guard must not take it for an explosion."""
-    mask = np.full_like(views()[1].mask, MaskState.BACKGROUND)
-    mask[a_person_pixel(1)] = MaskState.PERSON
-    _, story = fitted(TINY, training_set([*views()[:4], replace(views()[1], mask=mask)]))
+    """Such a view costs a hundred times what others do; the guard must not take it for an explosion."""
+    _, story = fitted(TINY, training_set([*views()[:4], only_a_pixel(1, MaskState.BACKGROUND)]))
     return Answer(story, "no step rejected")
 
 
-def _nothing(hidden: bool) -> Answer:
-    training = training_set(
-        [replace(v, mask=np.full_like(v.mask, MaskState.UNKNOWN)) for v in views()] if hidden else []
-    )
-
+def _nothing(shown: Sequence[TrainView]) -> Answer:
     def fit() -> Any:
-        return InpaintHuman(TINY).fit(training, device="cpu", seed=0, ledger=Ledger(), progress=Progress.silent())
+        return InpaintHuman(TINY).fit(
+            training_set(shown), device="cpu", seed=0, ledger=Ledger(), progress=Progress.silent()
+        )
 
     return Answer(words_of(BadInput, fit), "nothing to fit")
 
 
 def _behind() -> Answer:
-    """In one view the body is behind the camera."""
     camera, about = views()[0].camera, np.diag([-1.0, 1, -1])
     return _ratio(TINY, with_view(1, camera=Camera(camera.K, about @ camera.R, about @ camera.t, SIZE, SIZE)))
 
@@ -285,7 +263,7 @@ def _spoiled_once(how: str, at: int) -> Answer:
 
         stage._loss = spoiled
 
-    answer = _ratio(TINY, training_set(), prepare=spoil)
+    answer = _ratio(TINY, prepare=spoil)
     if f"step {at} rejected, back to 0" not in answer.note:
         raise AssertionError(f"expected step {at} rejected, got {answer.note!r}")
     return answer
@@ -306,17 +284,16 @@ def _spoiled_for_good(at: int) -> Answer:
 
         stage._one_step = step
 
-    after, story = fitted(TINY, training_set(), prepare=spoil)
+    after, story = fitted(TINY, prepare=spoil)
     assert after is None
     back = f"step {at} rejected, back to 0; " * MOST_ROLL_BACKS
     return Answer(story, f"{back}diverged, first bad step {at}: loss is nan")
 
 
 def _bad_start() -> Answer:
-    """A feature is NaN before the first step."""
     start = fresh(TINY)
     start.features.table.data[start.features.index[100]] = math.nan
-    return Answer(fitted(TINY, training_set(), start)[1], "diverged, first bad step 0")
+    return Answer(fitted(TINY, avatar=start)[1], "diverged, first bad step 0")
 
 
 def _resumed() -> Answer:
@@ -330,7 +307,7 @@ def _resumed() -> Answer:
         pass
 
     config = scaled_rates(1000.0)
-    whole, _ = fitted(config, training_set())
+    whole, _ = fitted(config)
     ledger = SavesAt11()
     stage = Stage1(fresh(config), training_set(), 0, ledger)
     one_step = stage._one_step
@@ -355,18 +332,17 @@ def _resumed() -> Answer:
 
 
 def _half_precision(name: str) -> Answer:
-    """The fit under autocast: matrix products in half precision, parameters and splats in float32."""
     import torch
 
     with torch.autocast("cpu", getattr(torch, name), cache_enabled=False):  # or the first weights would stay
-        return _ratio(TINY, training_set())
+        return _ratio(TINY)
 
 
 def _half_colours() -> Answer:
     """An avatar's pictures from parameters rounded to half precision: a grey level off at most, on average."""
     import torch
 
-    avatar, _ = fitted(TINY, training_set())
+    avatar, _ = fitted(TINY)
     assert avatar is not None
     view = views()[0]
     exact = avatar.render(view.camera, view.body_pose)[0]
@@ -395,8 +371,7 @@ OUT_OF_REACH = (
 
 CASES = [
     *(
-        _helps(f"rate-{factor:g}", f"step sizes × {factor:g}",
-               lambda factor=factor: _ratio(scaled_rates(factor), training_set()))
+        _helps(f"rate-{factor:g}", f"step sizes × {factor:g}", lambda factor=factor: _ratio(scaled_rates(factor)))
         for factor in (0.1, 1.0, 10.0, 100.0, 1000.0)
     ),
     _training("rate-1e30", "step sizes × 1e30", _absurd_rates, "words", 0, "the first step after the first update"),
@@ -405,8 +380,8 @@ CASES = [
         _helps(f"loss-{factor:g}", f"loss × {factor:g}, no clipping", partial(_clipped, factor))
         for factor in (1e-6, 1e12)
     ),
-    _helps("scale-collapse", "a fit from Gaussians e^-4 as large", partial(_scales, -4.0)),
-    _helps("scale-explosion", "a fit from Gaussians at the limit of their scale", partial(_scales, 4.0)),
+    _helps("scale-collapse", "a fit from Gaussians e^-4 as large", partial(_ratio, TINY, start=-4.0)),
+    _helps("scale-explosion", "a fit from Gaussians at the limit of their scale", partial(_ratio, TINY, start=4.0)),
     _exact("scale-collapse-gradient", "a scale factor of e^-4.9 has a gradient", partial(_dead_scales, -4.9)),
     _exact("scale-cut-gradient", "a scale factor of e^-6 has a gradient", partial(_dead_scales, -6.0),
            known=OUT_OF_REACH),
@@ -415,13 +390,16 @@ CASES = [
     _training("scale-limit", "the largest scale a decoder can ask for", _bounded_scales, "ulp", 1,
               "the limit in float32"),
     _helps("contradiction", "every view with its mask and with the opposite", _contradiction),
-    _helps("wrong-pose", "one frame has another's pose", _wrong_pose),
+    _helps("wrong-pose", "one frame has another's pose",
+           lambda: _ratio(TINY, with_view(2, body_pose=views()[5].body_pose))),
     _helps("one-frame", "one training frame", lambda: _ratio(TINY, training_set(views()[:1]))),
     _helps("two-frames", "two training frames", lambda: _ratio(TINY, training_set(views()[:2]))),
-    _helps("one-pixel", "one visible pixel in all", _one_pixel),
+    _helps("one-pixel", "one visible pixel in all",
+           lambda: _ratio(TINY, training_set([only_a_pixel(0, MaskState.UNKNOWN)]))),
     _step("speck", "a view of one person pixel on known background", _speck),
-    _refused("no-view", "no training view", partial(_nothing, False)),
-    _refused("all-hidden", "views without a visible pixel", partial(_nothing, True)),
+    _refused("no-view", "no training view", partial(_nothing, [])),
+    _refused("all-hidden", "views without a visible pixel",
+             lambda: _nothing([replace(v, mask=np.full_like(v.mask, MaskState.UNKNOWN)) for v in views()])),
     _helps("behind-camera", "a view with the body behind the camera", _behind),
     _step("nan-pixel", "a NaN among the person's pixels", partial(_bad_pixel, math.nan)),
     _step("inf-pixel", "an infinite person pixel", partial(_bad_pixel, math.inf)),
