@@ -20,8 +20,9 @@ A pixel that is half person is what a blurred painting is full of: a graph cut t
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -54,12 +55,20 @@ SAM_LAYOUT = (
 )
 
 
-class SilhouetteFinder(Protocol):
+class SilhouetteFinder(ABC):
     """Finds the complete person in a completed crop."""
+
+    reach = RIM  # of the body's height, see `_Rim`
 
     def complete(self, view: CropView, image: NDArray[np.uint8]) -> NDArray[np.bool_]:
         """[S, W] the complete person mask of the completed crop `image` [S, W, 3] RGB. Known pixels are as known."""
-        ...
+        rim = _Rim(view, self.reach)
+        found = self.found(rim, image) if rim.undecided.any() else None
+        return view.person | rim.core | (rim.undecided & (view.body if found is None else found))
+
+    @abstractmethod
+    def found(self, rim: _Rim, image: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
+        """[S, W] the person, looked at where it is undecided; None where the posed body must decide."""
 
 
 def silhouette_iou(found: NDArray[np.bool_], truth: NDArray[np.bool_]) -> float:
@@ -68,77 +77,68 @@ def silhouette_iou(found: NDArray[np.bool_], truth: NDArray[np.bool_]) -> float:
     return 1.0 if union == 0 else np.count_nonzero(found & truth) / union
 
 
-class CoverageSilhouette:
+class _OnBackground(SilhouetteFinder):
+    def __init__(self, background: tuple[float, float, float]):
+        self.background = 255 * np.array(background, np.float32)
+
+
+class CoverageSilhouette(_OnBackground):
     """A rim pixel is person when its colour lies more than half of the way from the background's to the person's.
 
     The person's colour is that of the nearest pixel deep inside the person. Where it is the background's, the posed
     body decides. `background` is RGB in [0, 1].
     """
 
-    def __init__(self, background: tuple[float, float, float]):
-        self.background = 255 * np.array(background, np.float32)
-
-    def complete(self, view: CropView, image: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        """See `SilhouetteFinder`."""
-        rim = _Rim(view)
-        if not rim.undecided.any():
-            return rim.result(view.body)
+    def found(self, rim: _Rim, image: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
+        view = rim.view
         from_background = image.astype(np.float32) - self.background
         deep = cv2.erode(view.person.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
         deep |= view.unknown & (rim.inside > rim.pixels(DEEP))
         if not deep.any():
-            return rim.result(view.body)
+            return None
         person = _nearest(from_background * deep[..., None], deep)
         contrast = (person**2).sum(-1)
         coverage = (from_background * person).sum(-1) / np.maximum(contrast, 1)
-        return rim.result(np.where(contrast < CONTRAST**2, view.body, coverage > COVERAGE))
+        return np.where(contrast < CONTRAST**2, view.body, coverage > COVERAGE)
 
 
-class GrabCutSilhouette:
+class GrabCutSilhouette(_OnBackground):
     """GrabCut, seeded by what is known and by the posed body. `background` is RGB in [0, 1]. Deterministic."""
 
-    def __init__(self, background: tuple[float, float, float]):
-        self.background = 255 * np.array(background, np.float32)
-
-    def complete(self, view: CropView, image: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        """See `SilhouetteFinder`."""
-        rim = _Rim(view)
-        if not rim.undecided.any():
-            return rim.result(view.body)
+    def found(self, rim: _Rim, image: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
+        view = rim.view
         differs = np.abs(image - self.background).max(-1) > GRABCUT_THRESHOLD
         labels = np.where(view.person | rim.core, cv2.GC_FGD, cv2.GC_BGD).astype(np.uint8)
         labels[rim.undecided] = np.where(view.body | differs, cv2.GC_PR_FGD, cv2.GC_PR_BGD)[rim.undecided]
         person = (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
         if person.all() or not person.any():
-            return rim.result(view.body)  # two colour models need two sets of pixels
+            return None  # two colour models need two sets of pixels
         cv2.setRNGSeed(0)  # the colour models start from k-means with random centres
         models = np.zeros((1, 65)), np.zeros((1, 65))
         no_box = (0, 0, 1, 1)  # the mask says it all
         cv2.grabCut(np.ascontiguousarray(image), labels, no_box, *models, GRABCUT_ROUNDS, cv2.GC_INIT_WITH_MASK)
-        return rim.result((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD))
+        return (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
 
 
-class SamSilhouette:
+class SamSilhouette(SilhouetteFinder):
     """HQ-SAM, prompted with the box of the posed body and with points on its parts.
 
     `weights` is a folder in transformers' layout, safetensors only. Raises `BadInput` for a folder that is missing,
     incomplete, pickled, damaged or another model. Nothing is downloaded.
     """
 
+    reach = SAM_REACH
+
     def __init__(self, weights: str, device: str = "cpu"):
         self.model, self.processor = _load_sam(weights, device)
         self.device = device
 
-    def complete(self, view: CropView, image: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        """See `SilhouetteFinder`."""
+    def found(self, rim: _Rim, image: NDArray[np.uint8]) -> NDArray[np.bool_]:
         import torch
 
-        rim = _Rim(view, SAM_REACH)
-        if not rim.undecided.any():
-            return rim.result(view.body)
         inputs = self.processor(
             images=np.ascontiguousarray(image),
-            input_points=[[[[float(x), float(y)] for x, y in _points_on_parts(smpl_parts(view.parts))]]],
+            input_points=[[[[float(x), float(y)] for x, y in _points_on_parts(smpl_parts(rim.view.parts))]]],
             input_boxes=[[[float(edge) for edge in _box(rim.outside <= rim.pixels(RIM))]]],
             return_tensors="pt",
         )
@@ -151,7 +151,7 @@ class SamSilhouette:
             masks = self.model(**prompt, multimask_output=False).pred_masks.float().cpu()
         sizes = inputs["original_sizes"], inputs["reshaped_input_sizes"]
         (mask,) = self.processor.post_process_masks(masks, *sizes)
-        return rim.result(mask[0, 0].numpy())
+        return mask[0, 0].numpy()
 
 
 SILHOUETTES = ("coverage", "grabcut", "sam")
@@ -189,10 +189,6 @@ class _Rim:
 
     def pixels(self, share: float) -> float:
         return max(share * self.height, 1.0)
-
-    def result(self, found: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """The complete mask from what was found in the undecided pixels."""
-        return self.view.person | self.core | (self.undecided & found)
 
 
 def _distance(mask: NDArray[np.bool_]) -> NDArray[np.float32]:

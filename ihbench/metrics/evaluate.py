@@ -25,6 +25,7 @@ from ihbench.metrics.images import (
     check_images,
     differing_pixels,
     grown,
+    in_colour,
     peak_of,
 )
 from ihbench.metrics.psnr import SquaredError
@@ -134,10 +135,7 @@ class Preset:
 
     def regions(self, asked: Sequence[str]) -> tuple[str, ...]:
         """The regions that the preset takes numbers over when a protocol asks for some."""
-        names = [
-            name for measure in self.measures for name in (asked if measure.regions is None else measure.regions)
-        ]
-        return tuple(dict.fromkeys(names))
+        return tuple(dict.fromkeys(name for measure in self.measures for name in measure.regions or asked))
 
 
 def evaluate(
@@ -164,7 +162,7 @@ def evaluate(
     uint8, the other float) and for a background outside [0, 1], `BadInput` for an unknown preset.
     """
     chosen = preset if isinstance(preset, Preset) else find_preset(preset)
-    pred, truth = (_color_image(image, name, hdr) for image, name in ((pred, "pred"), (truth, "truth")))
+    pred, truth = (in_colour(as_image(image, name, hdr=hdr)) for image, name in ((pred, "pred"), (truth, "truth")))
     check_images(pred, truth, mixed=True)
     if not hdr and (pred.dtype == np.uint8) == (truth.dtype == np.uint8):
         check_brightness(pred, truth)
@@ -214,14 +212,6 @@ def _known_outcomes(region: Mask | None, known: list[tuple[Mask | None, dict[int
             return outcomes
     known.append((region, {}))
     return known[-1][1]
-
-
-def _color_image(image: Any, name: str, hdr: bool) -> NDArray:
-    """[H, W, 3]; grey images get three equal channels."""
-    image = as_image(image, name, hdr=hdr)
-    if image.ndim == 2 or image.shape[2] == 1:
-        return np.repeat(image.reshape(*image.shape[:2], 1), 3, axis=2)
-    return image
 
 
 def _checked_region(region: Any, shape: tuple[int, ...]) -> Region:

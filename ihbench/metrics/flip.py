@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ihbench.metrics.images import Mask, as_background, bounds, checked, differing_pixels, grown
+from ihbench.metrics.images import Mask, as_background, bounds, checked, differing_pixels, grown, in_colour
 
 PPD = (
     0.7 * (3840 / 0.7) * math.pi / 180
@@ -80,7 +80,8 @@ def flip(
     empty mask gives NaN, a NaN or infinite pixel inside the mask NaN. Raises `ValueError` for shapes or dtypes that
     do not match, for what is no image (`images.as_image`), for a background outside [0, 1], and for a `ppd` below 1.
     """
-    pred, truth, mask = _checked_colors(pred, truth, mask, hdr)
+    pred, truth, mask = checked(pred, truth, mask, hdr=hdr)
+    pred, truth = in_colour(pred), in_colour(truth)
     as_background(background, 3)
     return mean_flip(pred, truth, differing_pixels(pred, truth), mask, background, ppd)
 
@@ -114,7 +115,7 @@ def flip_map(
     hdr: bool = False,
 ) -> NDArray[np.float64]:
     """[H, W] FLIP at every pixel; NaN where a filter meets a NaN or infinite pixel. Raises `ValueError` as `flip`."""
-    pred, truth, _ = _checked_colors(pred, truth, None, hdr)
+    pred, truth = map(in_colour, checked(pred, truth, hdr=hdr)[:2])
     filters = Filters.of(ppd)
     differs = differing_pixels(pred, truth)
     values = np.zeros(differs.shape)
@@ -180,16 +181,6 @@ def _hunt_lab(xyz: Sequence[Plane]) -> list[Plane]:
     x, y, z = (np.where(t > 216 / 24389, np.cbrt(t), t * (841 / 108) + 4 / 29) for t in xyz)
     lightness = 116 * y - 16
     return [lightness, 5 * lightness * (x - y), 2 * lightness * (y - z)]
-
-
-def _checked_colors(pred: Any, truth: Any, mask: Any, hdr: bool) -> tuple[NDArray, NDArray, Mask | None]:
-    """Two images [H, W, 3] and a mask that can be compared; grey becomes three channels. Raises `ValueError`."""
-    pred, truth, mask = checked(pred, truth, mask, hdr=hdr)
-    if pred.ndim == 2 or pred.shape[2] == 1:
-        pred, truth = (
-            np.broadcast_to(image.reshape(*image.shape[:2], 1), (*image.shape[:2], 3)) for image in (pred, truth)
-        )
-    return pred, truth, mask
 
 
 def _bands(differs: Mask, mask: Mask | None, radius: int) -> Iterator[tuple[slice, slice]]:

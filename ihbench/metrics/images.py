@@ -214,15 +214,8 @@ def checked(
 def _as_numeric(value: Any, name: str) -> NDArray:
     """An array or a tensor as a plain numpy array of numbers in the machine's byte order. Raises `ValueError`."""
     if hasattr(value, "detach"):  # a torch tensor; torch itself is not imported for this
-        try:
-            value = value.detach().cpu()
-            if "bfloat16" in str(value.dtype):
-                value = value.float()
-            value = value.numpy()
-        except (TypeError, RuntimeError, NotImplementedError) as error:  # sparse, quantised, without storage
-            raise ValueError(
-                f"{name}: expected a dense tensor, got one that numpy cannot read ({_first_line(error)})"
-            ) from None
+        value = value.detach().cpu().to_dense()
+        value = (value.float() if "bfloat16" in str(value.dtype) else value).numpy()
     if isinstance(value, np.ma.MaskedArray):
         raise ValueError(f"{name}: expected a plain array, got a masked one; fill it, and give its mask as `mask`")
     if not isinstance(value, np.ndarray):
@@ -230,8 +223,6 @@ def _as_numeric(value: Any, name: str) -> NDArray:
         word = "np.asarray(image.convert('RGB'))" if type(value).__module__.startswith("PIL.") else "np.asarray"
         raise ValueError(f"{name}: expected a numpy array or a torch tensor, got {kind}; convert it with {word}")
     value = np.asarray(value)  # without a subclass's own ideas of an index
-    if value.dtype.name == "bfloat16":  # of the ml_dtypes package
-        return value.astype(np.float32)
     return value if value.dtype.isnative else value.astype(value.dtype.newbyteorder("="))
 
 
@@ -261,13 +252,16 @@ def _layout_fault(shape: tuple[int, ...]) -> str | None:
     return "; channels come last, 1 or 3 of them"
 
 
-def _first_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:80]
-
-
 def peak_of(dtype: np.dtype) -> float:
     """The largest value of an image of this dtype: 255 for uint8, 1 for floats."""
     return 255.0 if dtype == np.uint8 else 1.0
+
+
+def in_colour(
+    image: NDArray,  # [H, W, C] or [H, W], C 1 or 3
+) -> NDArray:
+    """[H, W, 3], not to be written to; grey images get three equal channels."""
+    return np.broadcast_to(image if image.ndim == 3 else image[..., None], (*image.shape[:2], 3))
 
 
 def differing_pixels(

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from ihbench.errors import BadInput
 from ihbench.files.tensors import read_tensors
-from ihbench.metrics.images import as_background, as_mask, bounds, checked, peak_of
+from ihbench.metrics.images import as_background, as_mask, bounds, checked, in_colour, peak_of
 from ihbench.metrics.weights import FILES, locate
 
 NETS = ("vgg", "alex", "squeeze")
@@ -71,7 +71,7 @@ def lpips(
         if box is None or not mask.any():
             return math.nan
         rectangle = box
-    x, y = (_colors(image[rectangle]) for image in (pred, truth))
+    x, y = (_as_float32(in_colour(image[rectangle])) for image in (pred, truth))
     if mask is not None:
         inside = mask[rectangle][..., None]
         x, y = (np.where(inside, image, paint) for image in (x, y))
@@ -228,8 +228,6 @@ def random_networks(seed: int = 0) -> Iterator[dict[str, Network]]:
         _random.clear()
 
 
-def _colors(image: NDArray) -> NDArray[np.float32]:
-    """[H, W, 3] float32 with peak 1; grey images get three equal channels."""
-    if image.ndim == 2 or image.shape[2] == 1:
-        image = np.repeat(image.reshape(*image.shape[:2], 1), 3, axis=2)
+def _as_float32(image: NDArray) -> NDArray[np.float32]:
+    """The image with peak 1."""
     return (image / np.float32(peak_of(image.dtype))).astype(np.float32)

@@ -35,9 +35,7 @@ Compute = Callable[[Frame, Mask | None], float | str]
 # Ours
 
 
-def _prepare_rounded(
-    pred: NDArray, truth: NDArray, regions: Mapping[str, Region], background: Color
-) -> tuple[NDArray, NDArray]:
+def _prepare_rounded(pred: NDArray, truth: NDArray, *_: object) -> tuple[NDArray, NDArray]:
     return same_type(rounded(pred), rounded(truth))
 
 
@@ -81,23 +79,19 @@ def _lpips(frame: Frame, mask: Mask | None) -> float | str:
 
 def _named(metric: str, variant: str, value_range: str, painted: bool = False) -> Callable[[str, Color], Identity]:
     """The identity of a metric; `painted` where it paints what lies outside a region."""
-
-    def identity(region: str, background: Color) -> Identity:
-        paint = background_part(background) if painted and region != "full" else ""
-        return Identity(metric, variant, value_range, region, version=1, background=paint)
-
-    return identity
+    return partial(_identity, metric, variant, value_range, painted)
 
 
-def _without(net: str) -> Callable[[], str]:
+def _identity(metric: str, variant: str, value_range: str, painted: bool, region: str, background: Color) -> Identity:
+    paint = background_part(background) if painted and region != "full" else ""
+    return Identity(metric, variant, value_range, region, version=1, background=paint)
+
+
+def _lacking(net: str) -> str:
     """What is lacking for LPIPS with this trunk."""
+    from ihbench.metrics import lpips
 
-    def lacking() -> str:
-        from ihbench.metrics import lpips
-
-        return lpips.lacking(net)
-
-    return lacking
+    return lpips.lacking(net)
 
 
 IHBENCH = Preset(
@@ -112,7 +106,8 @@ IHBENCH = Preset(
                 "mean over the region of the SSIM map: Gaussian 11×11, sigma 1.5, population moments, mirrored "
                 "edges"),
         Measure(_named("lpips", "vgg-0.1", "[-1,1]", painted=True), _lpips,
-                "LPIPS v0.1, VGG, fed [-1,1]; regions cropped to the body's box", slow=True, lacking=_without("vgg")),
+                "LPIPS v0.1, VGG, fed [-1,1]; regions cropped to the body's box", slow=True,
+                lacking=partial(_lacking, "vgg")),
         Measure(_named("flip", "ldr-67ppd", "srgb", painted=True), _flip,
                 "mean over the region of the LDR-FLIP map at 67 pixels per degree; needs no weights"),
     ),
@@ -124,7 +119,7 @@ IHBENCH = Preset(
 # Released evaluators
 
 
-def _floats(pred: NDArray, truth: NDArray, regions: Mapping[str, Region], background: Color) -> tuple:
+def _floats(pred: NDArray, truth: NDArray, *_: object) -> tuple[NDArray, NDArray]:
     return as_float(pred), as_float(truth)
 
 
@@ -141,20 +136,15 @@ def _outside(image: NDArray, region: Region, background: Color) -> NDArray:
 
 
 def _boxed(
-    box: str, pred_to: Callable[[NDArray], NDArray], truth_to: Callable[[NDArray], NDArray], both: bool
-) -> Callable[..., tuple[NDArray, NDArray] | str]:
-    """Paint the prediction, or both images, outside the projected box, then convert each."""
-
-    def prepare(
-        pred: NDArray, truth: NDArray, regions: Mapping[str, Region], background: Color
-    ) -> tuple[NDArray, NDArray] | str:
-        region = regions.get(box, f"region {box!r}, outside of which this evaluator paints, was not given")
-        if isinstance(region, str):
-            return region
-        pred = _outside(pred, region, background)
-        return same_type(pred_to(pred), truth_to(_outside(truth, region, background) if both else truth))
-
-    return prepare
+    box: str, to: Callable[[NDArray], NDArray], both: bool,
+    pred: NDArray, truth: NDArray, regions: Mapping[str, Region], background: Color,
+) -> tuple[NDArray, NDArray] | str:  # fmt: skip
+    """Paint the prediction, or both images, outside the projected box, then convert both."""
+    region = regions.get(box, f"region {box!r}, outside of which this evaluator paints, was not given")
+    if isinstance(region, str):
+        return region
+    truth = _outside(truth, region, background) if both else truth
+    return same_type(to(_outside(pred, region, background)), to(truth))
 
 
 def _network(
@@ -235,7 +225,7 @@ def _measures(
         net, feed = lpips
         compute = lpips_of or (lambda frame, mask: _network(net, feed, frame.pred, frame.truth))
         identity, about = _named("lpips", f"{evaluator}-{net}", feed), f"LPIPS v0.1, {net}, fed {feed}"
-        measures.append(Measure(identity, compute, about, regions, slow=True, lacking=_without(net)))
+        measures.append(Measure(identity, compute, about, regions, slow=True, lacking=partial(_lacking, net)))
     for k, (form, compute) in enumerate(ssim.items()):
         value_range, about = SSIM_FORMS[form]
         measure = Measure(_named("ssim", f"{evaluator}-{form}", value_range), compute, about, regions)
@@ -256,7 +246,7 @@ HUMANNERF = Preset(
     name="humannerf",
     about="the whole frame in 8 bits, both images painted outside the projected box",
     source="chungyiweng/humannerf c753322 run.py:36-49, core/utils/image_util.py:18; metrics as told in its issue 8",
-    prepare=_boxed("box+0.3", truncated, truncated, both=True),
+    prepare=partial(_boxed, "box+0.3", truncated, True),
     measures=_measures("humannerf", "pooled", {"uniform7": _whole_ssim(SKIMAGE)}, ("vgg", "[-1,1]")),
     needs=("box+0.3",),
 )
@@ -265,7 +255,7 @@ OCCNERF = Preset(
     name="occnerf",
     about="8 bits; its vis is our body (on OcMotion our visible), its body our box; region means of one SSIM map",
     source="tiangexiang/OccNeRF 1cb1ef3 eval.py (unpack_to_image to psnr_metric, eval_model)",
-    prepare=_boxed("box+0.3", truncated, truncated, both=True),
+    prepare=partial(_boxed, "box+0.3", truncated, True),
     measures=_measures(
         "occnerf", "pooled", {"uniform7-map": _occnerf_ssim}, regions=("body", "visible", "box+0.3", "full")
     ),
@@ -277,7 +267,7 @@ GAUHUMAN = Preset(
     about="the whole frame, clamped; the prediction alone painted outside the box; also OccFusion's definition",
     source="skhu101/GauHuman 732ec0d render.py:61-91, utils/image_utils.py:17-19, utils/loss_utils.py; "
     "tiangexiang/OccFusion f41e091 stage1.py:302-351",
-    prepare=_boxed("box+0.05", _clamped, _clamped, both=False),
+    prepare=partial(_boxed, "box+0.05", _clamped, False),
     measures=_measures("gauhuman", "channels", {"gauss11-zero": _whole_ssim(SPLATTING)}, ("vgg", "[0,1]")),
     needs=("box+0.05",),
 )

@@ -31,13 +31,11 @@ BOOTSTRAP_FROM = 8  # subjects; with fewer, Student's t
 REPLICATES = 9999
 EXACT_UP_TO = 16  # subjects whose 2^n sign patterns are all tried; more are sampled
 PATTERNS = 20_000
-ORDINARY = 2.0**-450, 2.0**450  # the largest value of ordinary ones, whose squares need no care
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean over subjects and where the true one lies with confidence `level`; the ends are NaN for one subject, and
-    whatever lies beyond floating point is NaN, with `method` saying so."""
+    """A mean over subjects and where the true one lies with confidence `level`; the ends are NaN for one subject."""
 
     value: float
     low: float
@@ -63,7 +61,7 @@ def mean_interval(per_subject: Mapping[str, float | Sequence[float]], level: flo
     A subject's value is its mean, or its frames' scores. Raises `ValueError` for no subjects, for a subject without
     frames, for scores that are not finite, and for a level outside 0..1.
     """
-    return _interval(*_subject_means(per_subject), level, seed)
+    return _interval(_subject_means(per_subject), level, seed)
 
 
 def median_interval(per_subject: Mapping[str, float], level: float = 0.95) -> Interval:
@@ -76,16 +74,15 @@ def median_interval(per_subject: Mapping[str, float], level: float = 0.95) -> In
     """
     from scipy import stats
 
-    if not 0 < level < 1:
-        raise ValueError(f"interval: expected a level between 0 and 1, got {level}")
+    _check_level(level)
     if not per_subject:
         raise ValueError("interval: expected at least one subject")
-    values = np.sort(np.array([per_subject[subject] for subject in sorted(per_subject)], np.float64))
+    values = np.sort(np.array(list(per_subject.values()), np.float64))
     if np.isnan(values).any():
         raise ValueError("interval: expected numbers, got NaN; leave absent ones out")
     n = len(values)
     below, above = float(values[(n - 1) // 2]), float(values[n // 2])
-    middle = above if below == above else below / 2 + above / 2  # halves first: their sum may leave floating point
+    middle = (below + above) / 2
     if math.isnan(middle):
         return Interval(middle, below, above, level, n, "no median between -inf and inf")
     if n == 1:
@@ -100,7 +97,7 @@ def interval_ends(
     level: float = 0.95,
     seed: int = 0,
 ) -> NDArray[np.float64]:
-    """[2, ...]: low and high ends, one pair per data set; not finite where the spread leaves floating point.
+    """[2, ...]: low and high ends, one pair per data set.
 
     `cluster_bootstrap` from `BOOTSTRAP_FROM` subjects on, Student's t below that. Raises `ValueError` for fewer than
     2 subjects, for means that are not finite and for a level outside 0..1.
@@ -109,9 +106,8 @@ def interval_ends(
     if n >= BOOTSTRAP_FROM:
         return cluster_bootstrap(means, level, seed)
     _check_finite(means)
-    means, scale = _scaled(means)
     half = _t_quantile(n, level) * np.std(means, axis=-1, ddof=1) / math.sqrt(n)
-    return _times(np.mean(means, axis=-1) + np.array([-half, half]), scale)
+    return np.mean(means, axis=-1) + np.array([-half, half])
 
 
 def cluster_bootstrap(
@@ -133,11 +129,10 @@ def cluster_bootstrap(
     n = means.shape[-1]
     quantile = _t_quantile(n, level)
     _check_finite(means)
-    means, scale = _scaled(means)
     tail = stats.norm.cdf(-math.sqrt(n / (n - 1)) * quantile)
     # frames are not resampled within subjects: their scatter is in that of the subjects' means and would count twice
     counts = np.random.default_rng(seed).multinomial(n, np.full(n, 1 / n), size=replicates)  # [replicates, n]
-    return _times(np.quantile(means @ (counts / n).T, [tail, 1 - tail], axis=-1), scale)
+    return np.quantile(means @ (counts / n).T, [tail, 1 - tail], axis=-1)
 
 
 def paired_test(
@@ -162,10 +157,8 @@ def paired_test(
     n = len(a)
     if n < 2:
         raise ValueError(f"paired test: expected at least 2 subjects, got {n}")
-    (of_a, scale_a), (of_b, scale_b) = _subject_means(a), _subject_means(b)
-    scale = max(scale_a, scale_b)
-    differences = of_a * (scale_a / scale) - of_b * (scale_b / scale)
-    interval = _interval(differences, scale, level, seed)
+    differences = _subject_means(a) - _subject_means(b)
+    interval = _interval(differences, level, seed)
     smallest = 2.0 ** (1 - n)
     if test == "wilcoxon":
         return Paired(interval, _wilcoxon_p(differences), smallest, test)
@@ -193,8 +186,8 @@ def smallest_detectable_difference(differences: Sequence[float], alpha: float = 
     """The true mean difference that a paired t test over subjects like these would find with this power.
 
     From the scatter of the differences seen, by the noncentral distribution of t²; a few subjects know their scatter
-    badly, and this number no better. NaN for fewer than 2 subjects and where it is beyond floating point, 0 where the
-    differences do not scatter. Raises `ValueError` for differences that are not finite and unless
+    badly, and this number no better. NaN for fewer than 2 subjects and for an alpha too small to have a quantile, 0
+    where the differences do not scatter. Raises `ValueError` for differences that are not finite and unless
     0 < alpha < power < 1.
     """
     from scipy import optimize, stats
@@ -207,12 +200,11 @@ def smallest_detectable_difference(differences: Sequence[float], alpha: float = 
         raise ValueError(f"smallest detectable difference: expected 0 < alpha < power < 1, got {alpha} and {power}")
     if n < 2:
         return math.nan
-    values, scale = _scaled(values)
     deviation = float(np.std(values, ddof=1))
     if deviation == 0:
         return 0.0
     quantile = float(stats.t.ppf(1 - alpha / 2, n - 1))
-    if not quantile < ORDINARY[1]:
+    if not quantile < 1e100:
         return math.nan
     critical = quantile**2
 
@@ -224,7 +216,12 @@ def smallest_detectable_difference(differences: Sequence[float], alpha: float = 
     while missing(largest) > 0:
         largest *= 2
     root = optimize.root_scalar(missing, bracket=(0, largest), method="brentq").root
-    return _absent_beyond(root * deviation / math.sqrt(n) * scale)
+    return root * deviation / math.sqrt(n)
+
+
+def _check_level(level: float) -> None:
+    if not 0 < level < 1:
+        raise ValueError(f"interval: expected a level between 0 and 1, got {level}")
 
 
 def _t_quantile(n: int, level: float) -> float:
@@ -232,41 +229,19 @@ def _t_quantile(n: int, level: float) -> float:
 
     if n < 2:
         raise ValueError(f"interval: expected at least 2 subjects, got {n}")
-    if not 0 < level < 1:
-        raise ValueError(f"interval: expected a level between 0 and 1, got {level}")
+    _check_level(level)
     return float(special.stdtrit(n - 1, 0.5 + level / 2))
 
 
-def _interval(means: NDArray[np.float64], scale: float, level: float, seed: int) -> Interval:
-    """`mean_interval` of subjects' means [n] times a scale."""
-    n, value = len(means), float(np.mean(means)) * scale
+def _interval(means: NDArray[np.float64], level: float, seed: int) -> Interval:
+    """`mean_interval` of subjects' means [n]."""
+    n, value = len(means), float(np.mean(means))
     if n == 1:
         return Interval(value, math.nan, math.nan, level, n, "one subject has no interval")
     low, high = interval_ends(means, level, seed).tolist()
     method = ("Student's t" if n < BOOTSTRAP_FROM else "cluster bootstrap") + f" over {n} subjects"
     # rounding may put the mean of equal subjects beside their bootstrap
-    low, high = _absent_beyond(min(low * scale, value)), _absent_beyond(max(high * scale, value))
-    if math.isnan(low) or math.isnan(high):
-        low, high, method = math.nan, math.nan, f"{method}, beyond floating point"
-    return Interval(_absent_beyond(value), low, high, level, n, method)
-
-
-def _scaled(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Values whose squares neither overflow nor vanish, and the power of two to multiply by; 1 for ordinary ones."""
-    largest = float(np.abs(values).max(initial=0.0))
-    if largest == 0 or ORDINARY[0] < largest < ORDINARY[1]:
-        return values, 1.0
-    scale = math.ldexp(1.0, min(math.frexp(largest)[1], 1023))
-    return values / scale, scale
-
-
-def _times(values: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
-    with np.errstate(over="ignore"):
-        return values * scale
-
-
-def _absent_beyond(value: float) -> float:
-    return value if math.isfinite(value) else math.nan
+    return Interval(value, min(low, value), max(high, value), level, n, method)
 
 
 def _check_finite(means: NDArray[np.float64]) -> None:
@@ -274,17 +249,15 @@ def _check_finite(means: NDArray[np.float64]) -> None:
         raise ValueError("interval: expected finite means; leave absent and infinite ones out")
 
 
-def _subject_means(per_subject: Mapping[str, float | Sequence[float]]) -> tuple[NDArray[np.float64], float]:
-    """[n] in the order of the subjects' names, so that the order of a dictionary changes nothing, and what to
-    multiply them by."""
+def _subject_means(per_subject: Mapping[str, float | Sequence[float]]) -> NDArray[np.float64]:
+    """[n] in the order of the subjects' names, so that the order of a dictionary changes nothing."""
     if not per_subject:
         raise ValueError("interval: expected at least one subject")
     scores = {subject: np.asarray(per_subject[subject], np.float64) for subject in sorted(per_subject)}
     bad = [subject for subject, values in scores.items() if not (values.size and np.isfinite(values).all())]
     if bad:
         raise ValueError(f"interval: expected finite scores of {', '.join(bad)}; leave absent and infinite ones out")
-    _, scale = _scaled(np.array([np.abs(values).max() for values in scores.values()]))
-    return np.array([np.mean(values / scale) for values in scores.values()], np.float64), scale
+    return np.array([np.mean(values) for values in scores.values()], np.float64)
 
 
 def _sign_flip_p(differences: NDArray[np.float64], seed: int) -> float:

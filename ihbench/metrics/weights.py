@@ -71,7 +71,7 @@ def folders() -> list[Path]:
     own, torch_home, users = path_from("IHBENCH_WEIGHTS"), path_from("TORCH_HOME"), users_cache()
     if torch_home is None and users is not None:
         torch_home = users / "torch"
-    folders = [*([own] if own else []), *([torch_home / "hub" / "checkpoints"] if torch_home else [])]
+    folders = [folder for folder in (own, torch_home and torch_home / "hub" / "checkpoints") if folder]
     if not folders:
         raise BadInput("this user has no home folder to keep weights in; name a folder for them with IHBENCH_WEIGHTS")
     return folders
@@ -79,7 +79,7 @@ def folders() -> list[Path]:
 
 def locate(weights: WeightFile) -> Path | str:
     """The file, or why there is none, in a line: what is missing, where it goes, how to get it."""
-    damaged = ""
+    what = "missing; put it"
     try:
         places = folders()
     except BadInput as error:
@@ -89,8 +89,8 @@ def locate(weights: WeightFile) -> Path | str:
         if os.path.isfile(path):  # Path's own raises in other users' folders
             if is_right(weights, path):
                 return path
-            damaged = f"{_short(path)} is damaged or another file (its hash does not begin with {weights.sha256}); "
-    what = f"{damaged}move it away, then put the right one" if damaged else "missing; put it"
+            damaged = f"{_short(path)} is damaged or another file (its hash does not begin with {weights.sha256})"
+            what = f"{damaged}; move it away, then put the right one"
     return (
         f"{weights.used_by} needs {weights.file}: {what} into {_short(places[0])}, or on a connected machine run: "
         f"ihbench weights fetch {weights.name}"
@@ -112,11 +112,8 @@ def is_right(weights: WeightFile, path: Path) -> bool:
         about = path.stat()
         key = str(path.resolve()), about.st_size, about.st_mtime_ns
         if key not in _CHECKED:
-            digest = hashlib.sha256()
             with open(path, "rb") as file:
-                while chunk := file.read(CHUNK):
-                    digest.update(chunk)
-            _CHECKED[key] = digest.hexdigest().startswith(weights.sha256)
+                _CHECKED[key] = hashlib.file_digest(file, "sha256").hexdigest().startswith(weights.sha256)
         return _CHECKED[key]
     except OSError:
         return False
@@ -135,7 +132,6 @@ def fetch(weights: WeightFile, progress: Progress) -> Path:
     by_hand = f"download {weights.url} elsewhere and put it into {target.parent}"
     if os.path.lexists(target) and not (target.is_symlink() and not target.exists()):
         raise BadInput(f"{target}: is damaged or another file (its hash differs); move it away, then fetch again")
-    digest = hashlib.sha256()
     try:
         with (
             urllib.request.urlopen(weights.url, timeout=PATIENCE) as source,
@@ -143,13 +139,11 @@ def fetch(weights: WeightFile, progress: Progress) -> Path:
             open(temporary, "wb") as file,
             progress.task(f"fetching {weights.file} (MB)", round(weights.size_mb)) as task,
         ):
-            done = 0
             while chunk := source.read(CHUNK):
                 file.write(chunk)
-                digest.update(chunk)
-                done += len(chunk)
-                task.advance(done // 10**6 - task.done)
-            if not digest.hexdigest().startswith(weights.sha256):
+                task.advance(file.tell() // 10**6 - task.done)
+            file.flush()
+            if not is_right(weights, temporary):
                 raise BadInput(
                     f"{weights.url}: what came is not {weights.file} (its hash differs); try again, or {by_hand}"
                 )
@@ -162,21 +156,12 @@ def fetch(weights: WeightFile, progress: Progress) -> Path:
 def states(names: Iterable[str] = FILES) -> list[dict[str, object]]:
     """What `ihbench weights list` shows: "present", "missing" or "damaged", and where."""
     states = []
-    for name in names:
-        weights = find_weights(name)
+    for weights in map(find_weights, names):
         paths = [folder / weights.file for folder in folders()]
         present = [path for path in paths if os.path.isfile(path)]
         right = [path for path in present if is_right(weights, path)]
-        states.append(
-            {
-                "name": name,
-                "file": weights.file,
-                "size_mb": weights.size_mb,
-                "state": "present" if right else "damaged" if present else "missing",
-                "path": str((right or present or paths)[0]),
-                "used_by": weights.used_by,
-                "url": weights.url,
-                "licence": weights.licence,
-            }
-        )
+        state = "present" if right else "damaged" if present else "missing"
+        entry: dict[str, object] = {name: getattr(weights, name) for name in ("name", "file", "size_mb")}
+        entry |= {"state": state, "path": str((right or present or paths)[0])}
+        states.append(entry | {name: getattr(weights, name) for name in ("used_by", "url", "licence")})
     return states

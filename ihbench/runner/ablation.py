@@ -67,8 +67,7 @@ def grid(config: Any, vary: Mapping[str, Sequence[Any]]) -> AblationSuite:
         if not values:
             raise BadInput(f"--vary {name}: expected a value or more")
         refuse_repeated(values, f"--vary {name}")
-    combinations = product(*vary.values())
-    grids = [dict(zip(vary, values, strict=True)) for values in combinations]
+    grids = [dict(zip(vary, values, strict=True)) for values in product(*vary.values())]
     variants = [Variant(name, switches) for name, switches in zip(_names(grids), grids, strict=True)]
     first = variants[0].name
     comparisons = tuple(Comparison(f"{one.name} instead of {first}", first, one.name) for one in variants[1:])
@@ -79,8 +78,6 @@ def _names(grids: Sequence[Mapping[str, Any]]) -> list[str]:
     """One name a combination: what varies, cut to `ROOM`, with a number where that would make two alike."""
     several = [name for name in grids[0] if len({_plain(switches[name]) for switches in grids}) > 1] or list(grids[0])
     words = [", ".join(f"{name}={_plain(switches[name])}" for name in several) for switches in grids]
-    if all(len(text) <= ROOM for text in words):
-        return words
     return [text if len(text) <= ROOM else f"{k + 1}: {text[: ROOM - 1]}…" for k, text in enumerate(words)]
 
 

@@ -71,17 +71,14 @@ def run_cells(
 
         if workers == 0:
             for number, cell in enumerate(cells):
-                ended(number, _in_this_process(cell))
+                try:
+                    outcome = CellOutcome(cell, run_scene(cell.request, cell.source, cell.scene, Progress.silent()))
+                except Exception as error:  # one cell takes no other along
+                    outcome = CellOutcome(cell, None, _told(error))
+                ended(number, outcome)
         else:
             _side_by_side(cells, workers, threads, ended, cards)
     return [outcomes[number] for number in range(len(cells))]
-
-
-def _in_this_process(cell: Cell) -> CellOutcome:
-    try:
-        return CellOutcome(cell, run_scene(cell.request, cell.source, cell.scene, Progress.silent()))
-    except Exception as error:  # one cell takes no other along
-        return CellOutcome(cell, None, _told(error))
 
 
 def _told(error: Exception) -> str:

@@ -100,11 +100,8 @@ class ScoreStage:
         except BadInput as damage:
             self.progress.say(f"calibration rows are computed again: {damage}")
             return None
-        views = {
-            (group_row(row, key.group), key.camera_id, key.frame)
-            for row in ROWS
-            for key in self.scorer.scene.test_keys
-        }
+        keys = self.scorer.scene.test_keys
+        views = {(group_row(row, key.group), key.camera_id, key.frame) for row in ROWS for key in keys}
         return lines if {(line.row, line.camera, line.frame) for line in lines} == views else None
 
     def _calibration_file(self) -> Path:

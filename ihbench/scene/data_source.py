@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import unicodedata
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -107,14 +108,10 @@ def folder_nearby(root: Path, datasets: Iterable[str]) -> Path | None:
     except OSError:
         below = []
     for folder in (*below[:NEARBY], *list(here.parents)[:2]):
-        if folder.name.startswith((".", "__MACOSX")):
-            continue
-        for name in datasets:
-            try:
+        for name in () if folder.name.startswith((".", "__MACOSX")) else datasets:
+            with suppress(BadInput):
                 registry.load("dataset", name)(folder)
-            except BadInput:
-                continue
-            return folder
+                return folder
     return None
 
 
@@ -188,11 +185,10 @@ def body_file(named: Path, gender: str) -> Path:
 def wanted_frames(protocol: Protocol, standin: type) -> dict[int, list[int]]:
     """Camera index -> frames that a protocol reads of every stand-in subject."""
     n_frames, n_cameras = standin.n_frames, standin.n_cameras
-    frames_of: dict[int, set[int]] = {protocol.train.camera: set()}
-    for subject in standin.subjects(1):  # all of a cast have the same frames
-        frames_of[protocol.train.camera] |= set(protocol.training_frames(subject, n_frames))
-        for camera, frame, _ in protocol.test_views(subject, n_frames, n_cameras):
-            frames_of.setdefault(camera, set()).add(frame)
+    (subject,) = standin.subjects(1)  # all of a cast have the same frames
+    frames_of: dict[int, set[int]] = {protocol.train.camera: set(protocol.training_frames(subject, n_frames))}
+    for camera, frame, _ in protocol.test_views(subject, n_frames, n_cameras):
+        frames_of.setdefault(camera, set()).add(frame)
     return {camera: sorted(frames) for camera, frames in frames_of.items()}
 
 

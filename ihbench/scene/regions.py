@@ -64,8 +64,7 @@ class SurfaceMap:
         }
         masks = {}
         for name in names:
-            padding = re.fullmatch(r"box\+([0-9.]+)", name)
-            if padding:
+            if padding := re.fullmatch(r"box\+([0-9.]+)", name):
                 region = projected_box(vertices, view.camera, float(padding[1]))
             elif name in every:
                 region = every[name]()

@@ -73,27 +73,24 @@ class LazyViews(Sequence[View]):
     def preload(self, workers: int = 2) -> Preloading:
         """Begin to make the first `held` items, in order, on threads of their own (image decoding releases the
         interpreter lock). What cannot be made is left to whoever asks for it, who gets the error."""
-        return Preloading(self, min(self._length, self._held), workers)
+        pool = Preloading(workers, thread_name_prefix="preload")
+        pool.futures = [pool.submit(self.__getitem__, index) for index in range(min(self._length, self._held))]
+        return pool
 
 
-class Preloading:
+class Preloading(ThreadPoolExecutor):
     """Items being made in the background. As a context it ends with what has been begun; `wait` waits for all."""
 
-    def __init__(self, views: LazyViews, count: int, workers: int):
-        self._pool = ThreadPoolExecutor(workers, thread_name_prefix="preload")
-        self._futures = [self._pool.submit(views.__getitem__, index) for index in range(count)]
+    futures: Sequence[Future]
 
     def wait(self) -> None:
         """Wait for all of them, and raise what went wrong with the first that failed."""
-        for future in self._futures:
+        for future in self.futures:
             future.result()
-        self._pool.shutdown()
-
-    def __enter__(self) -> Preloading:
-        return self
+        self.shutdown()
 
     def __exit__(self, *_: object) -> None:
-        self._pool.shutdown(wait=True, cancel_futures=True)
+        self.shutdown(wait=True, cancel_futures=True)
 
 
 @dataclass(frozen=True)

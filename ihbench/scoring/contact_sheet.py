@@ -27,9 +27,8 @@ class SheetRow:
     def __post_init__(self) -> None:
         """Raises `ValueError` for other layouts; uint8 becomes float, and what is out of range is clipped later."""
         for name in ("truth", "prediction"):
-            object.__setattr__(
-                self, name, as_float(as_image(getattr(self, name), name, hdr=True)).astype(np.float32, copy=False)
-            )
+            image = as_float(as_image(getattr(self, name), name, hdr=True))
+            object.__setattr__(self, name, image.astype(np.float32, copy=False))
         check_images(self.prediction, self.truth)
         if self.training.dtype != np.uint8 or self.training.shape[2:] != (3,):
             raise ValueError(

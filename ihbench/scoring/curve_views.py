@@ -39,7 +39,9 @@ def curve_views(scorer: Scorer, count: int) -> list[int]:
     looked_at = {frames[k] for k in spread(len(frames), MOST_FRAMES)}
     own = [k for k in own if keys[k].frame in looked_at]
     asked = [keys[k] for k in own]
-    traits = _weighted(_raw_traits(scorer, asked))
+    traits = _standard(_raw_traits(scorer, asked))
+    traits[:, 4:6] *= SHARES_COUNT
+    traits = np.concatenate([traits, _standard(traits**2)], 1)  # the spread is matched, too, not only the mean
     chosen = representatives(traits, [key.camera for key in asked], [key.frame for key in asked], count)
     return [own[k] for k in chosen]
 
@@ -57,15 +59,12 @@ def representatives(
     target = traits.mean(0)
     most = [-(-count // len(set(names))) for names in (cameras, frames)]  # of one camera, of one frame
 
-    def free(taken: Sequence[int]) -> NDArray[np.int64]:
-        """Views that may join those taken; where the limits leave none, any other."""
+    def best(taken: Sequence[int]) -> tuple[float, int]:
+        """Of the views that may join those taken; where the limits leave none, of any other."""
         used = Counter(cameras[k] for k in taken), Counter(frames[k] for k in taken)
         rest = [k for k in range(len(traits)) if k not in taken]
         fair = [k for k in rest if used[0][cameras[k]] < most[0] and used[1][frames[k]] < most[1]]
-        return np.array(fair or rest)
-
-    def best(taken: Sequence[int]) -> tuple[float, int]:
-        candidates = free(taken)
+        candidates = np.array(fair or rest)
         means = (traits[list(taken)].sum(0) + traits[candidates]) / (len(taken) + 1)
         costs = ((means - target) ** 2).sum(1)
         k = int(costs.argmin())
@@ -78,8 +77,7 @@ def representatives(
     for _ in range(ROUNDS):
         before = cost
         for place in range(count):
-            others = chosen[:place] + chosen[place + 1 :]
-            new_cost, k = best(others)
+            new_cost, k = best(chosen[:place] + chosen[place + 1 :])
             if new_cost < cost * (1 - 1e-9):
                 chosen[place], cost = k, new_cost
         if cost == before:
@@ -108,13 +106,6 @@ def _raw_traits(scorer: Scorer, keys: Sequence[TestViewKey]) -> NDArray[np.float
         size = np.log1p(len(shown))
         rows.append([*direction, key.frame, *shares, size])
     return np.array(rows, np.float64)
-
-
-def _weighted(raw: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[N, D] each about its mean, in units of its deviation, times its weight."""
-    plain = _standard(raw)
-    plain[:, 4:6] *= SHARES_COUNT
-    return np.concatenate([plain, _standard(plain**2)], 1)  # the spread is matched, too, not only the mean
 
 
 def _standard(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -89,16 +89,14 @@ class Doubts:
         part, own = truth[rows, columns], image[rows, columns]
         changed = [change(image)[rows, columns] for change in TURNS.values()]
         changed += [change(own) for change in COLOURS.values()]
-
-        def error(of: NDArray) -> float:  # of [h, w, 3], like part
-            return float(np.square(of - part).mean())
+        errors = [float(np.square(one - part).mean()) for one in (own, *changed)]
 
         behind = (np.abs(truth - self._background) < SAME / 2).all(2)
         inside = loaded.view.silhouette[rows, columns]
         self._looks[loaded.index] = _Look(
             loaded.key.name,
-            error(own),
-            tuple(error(one) for one in changed),
+            errors[0],
+            tuple(errors[1:]),
             _person_errors(own[inside], part[inside]),
             *_moved(own.mean(2), part.mean(2)),
             np.median(image[behind], 0).astype(np.float64) if behind.sum() >= LEAST_BACKGROUND else None,
@@ -162,9 +160,9 @@ def _exchanged(doubted: list[_Look], looks: list[_Look]) -> Iterator[tuple[float
 def _shifted(looks: list[_Look]) -> list[str]:
     moved = np.stack([look.moved for look in looks])
     middle = np.median(moved, 0)
-    if np.abs(middle).max() <= MOVED or (np.abs(moved - middle) <= MOVED).all(1).mean() < MOST:
-        return []
-    if np.median([look.explained for look in looks]) < EXPLAINED:
+    agreed = (np.abs(moved - middle) <= MOVED).all(1).mean() >= MOST
+    explained = np.median([look.explained for look in looks]) >= EXPLAINED
+    if np.abs(middle).max() <= MOVED or not agreed or not explained:
         return []
     return [
         f"predictions lie {middle[0]:+.1f} px right of and {middle[1]:+.1f} px below the truth: is a pixel's centre "

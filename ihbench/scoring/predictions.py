@@ -95,30 +95,22 @@ def find_predictions(
     from the folder: another scene's images are not surplus. Raises `BadInput` for a folder that is none, a pattern
     that is malformed, leaves the folder or names one file for two views, and when no view has an image.
     """
-    patterns = DEFAULT_PATTERNS if pattern is None else (pattern,)
-    candidates = {p: _expected(p, scene, keys) for p in patterns}
-    pattern, names = max(
-        candidates.items(), key=lambda item: sum((root / name).is_file() for name in item[1].values())
-    )
+    candidates = {p: _expected(p, scene, keys) for p in (DEFAULT_PATTERNS if pattern is None else (pattern,))}
+    pattern = max(candidates, key=lambda p: sum((root / name).is_file() for name in candidates[p].values()))
+    names = candidates[pattern]
     present = {key: root / name for key, name in names.items() if (root / name).is_file()}
-    every = image_files(root)
+    every = {path: path.relative_to(root).as_posix() for path in image_files(root)}
     if not present:
         raise BadInput(
             f"predictions {root}: no image of any of the {len(keys)} test views of {scene}; expected "
-            f"{_some([names[key] for key in keys])}; found {_some([_below(root, p) for p in every])}; "
+            f"{_some(list(names.values()))}; found {_some(list(every.values()))}; "
             "say how they are named with --pattern"
         )
     known = set(present.values())
-    for other in scenes:
-        if other != scene:
-            known |= {root / name for name in _expected(pattern, other, keys).values()}
-    return Predictions(
-        root,
-        pattern,
-        present,
-        tuple(names[key] for key in keys if key not in present),
-        tuple(_below(root, p) for p in every if p not in known),
-    )
+    for other in set(scenes) - {scene}:
+        known |= {root / name for name in _expected(pattern, other, keys).values()}
+    missing = tuple(names[key] for key in keys if key not in present)
+    return Predictions(root, pattern, present, missing, tuple(name for p, name in every.items() if p not in known))
 
 
 def image_files(root: Path) -> list[Path]:
@@ -222,10 +214,6 @@ def _expected(pattern: str, scene: str, keys: Sequence[TestViewKey]) -> dict[Tes
             f"--pattern {pattern!r}: names one file for several views; use {{camera}} and {{frame}}, or {{index}}"
         )
     return names
-
-
-def _below(root: Path, path: Path) -> str:
-    return path.relative_to(root).as_posix()
 
 
 def _some(names: Sequence[str], most: int = 2) -> str:

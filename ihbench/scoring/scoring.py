@@ -112,21 +112,17 @@ class Scorer:
         if image is not None:
             image = as_prediction(image, loaded)
             if loaded.view.hidden is not None:
-                image = _with_truth(image, loaded.view.image, loaded.view.hidden)
+                # whoever drew the person there and whoever left them out are told the same
+                truth = loaded.view.image
+                paint = rounded(truth) if image.dtype == np.uint8 else truth.astype(image.dtype)
+                image = np.where(loaded.view.hidden[..., None], paint, image)
         for preset in self.presets:
             if image is None:
                 scores |= preset.absent(protocol.metrics.regions, background, "no prediction of this view")
             else:
-                scores |= evaluate(
-                    image,
-                    loaded.view.image,
-                    loaded.regions,
-                    preset,
-                    background,
-                    slow,
-                    protocol.metrics.regions,
-                    self.withheld,
-                    hdr=True,  # `as_prediction` has looked at the range
+                over = protocol.metrics.regions
+                scores |= evaluate(  # hdr: `as_prediction` has looked at the range
+                    image, loaded.view.image, loaded.regions, preset, background, slow, over, self.withheld, hdr=True
                 )
         return ViewScores(loaded.key, scores)
 
@@ -156,15 +152,12 @@ class Scorer:
                 after_each(loaded, images)
             return ScoredView(loaded, images, scores)
 
-        def whole(index: int) -> ScoredView:
-            return finish(self.load(index), None)
-
         with single_threaded_libraries(), ThreadPoolExecutor(workers) as pool:
             try:
                 waiting: deque[Future] = deque()
                 if threaded:
                     for index in indices:
-                        waiting.append(pool.submit(whole, index))
+                        waiting.append(pool.submit(lambda index=index: finish(self.load(index), None)))
                         if len(waiting) > workers + AHEAD:
                             yield waiting.popleft().result()
                 else:
@@ -181,13 +174,6 @@ class Scorer:
                     yield waiting.popleft().result()
             finally:
                 pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _with_truth(image: NDArray, truth: NDArray[np.float32], hidden: NDArray[np.bool_]) -> NDArray:
-    """A prediction [H, W, 3] with the truth's paint where the truth is not known: whoever drew the person there and
-    whoever left them out are told the same."""
-    paint = rounded(truth) if image.dtype == np.uint8 else truth.astype(image.dtype)
-    return np.where(hidden[..., None], paint, image)
 
 
 def as_prediction(image: Any, loaded: LoadedView) -> NDArray:

@@ -63,7 +63,6 @@ WRONG = {
     "a list": (lambda x: x.tolist(), "list.*np.asarray"),
     "a picture": (lambda x: Image.fromarray((x * 255).astype(np.uint8)), r"convert\('RGB'\)"),
     "a masked array": (lambda x: np.ma.masked_array(x, x > 0.9), "masked"),
-    "a sparse tensor": (lambda x: torch.tensor(x).to_sparse(), "dense"),
     "nothing": (lambda x: None, "NoneType"),
 }
 

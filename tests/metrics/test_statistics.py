@@ -362,66 +362,12 @@ def test_never_is_a_value_like_any_other():
 
 # ------------------------------------------------------------------------------------- the ends of floating point
 
-EXTREMES = [0.0, 1.0, -1.0, 5e-324, 1e-200, -3e-200, 1e100, 1e154, 1.3e300, 1.7e308, -1.7e308]
-
 
 @pytest.fixture
 def no_warning():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         yield
-
-
-def spread(n, scale):
-    return {f"s{k}": float((1 + k / n) * scale) for k in range(n)}
-
-
-@pytest.mark.parametrize("n", [2, 5, 7, 8, 20])
-@pytest.mark.parametrize("scale", [2.0**-1000, 2.0**-500, 2.0**500, 2.0**900, 2.0**1022, -(2.0**1022)])
-def test_intervals_scale_with_their_values_to_the_ends_of_floating_point(no_warning, n, scale):
-    plain, scaled = mean_interval(spread(n, 1.0)), mean_interval(spread(n, scale))
-    sign = math.copysign(1, scale)
-    low, high = (plain.low, plain.high) if sign > 0 else (-plain.high, -plain.low)
-    assert scaled.value == pytest.approx(plain.value * scale, rel=1e-12)
-    if all(math.isfinite(end * abs(scale)) for end in (low, high)):
-        assert scaled.low == pytest.approx(low * abs(scale), rel=1e-9)
-        assert scaled.high == pytest.approx(high * abs(scale), rel=1e-9)
-    else:
-        assert math.isnan(scaled.low)
-        assert math.isnan(scaled.high)
-        assert "beyond floating point" in scaled.method
-    zero = dict.fromkeys(spread(n, 1.0), 0.0)
-    test, as_ever = paired_test(spread(n, scale), zero), paired_test(spread(n, 1.0), zero)
-    assert test.p == as_ever.p
-    assert test.interval.value == scaled.value
-    opposite = paired_test(spread(n, scale), spread(n, -scale))
-    assert opposite.p == as_ever.p
-    differences = list(spread(n, scale).values())
-    found = smallest_detectable_difference(differences)
-    expected = smallest_detectable_difference(list(spread(n, 1.0).values())) * abs(scale)
-    assert found == pytest.approx(expected, rel=1e-9) if math.isfinite(expected) else math.isnan(found)
-    median = median_interval(spread(n, scale))
-    assert median.value == pytest.approx(median_interval(spread(n, 1.0)).value * scale, rel=1e-12)
-
-
-@pytest.mark.parametrize("seed", range(30))
-def test_any_finite_values_give_finite_or_absent_numbers_quietly(no_warning, seed):
-    rng = np.random.default_rng(seed)
-    n = int(rng.integers(1, 12))
-    a, b = ({f"s{k}": rng.choice(EXTREMES, rng.integers(1, 4)).tolist() for k in range(n)} for _ in range(2))
-    intervals = [mean_interval(a), median_interval({k: v[0] for k, v in a.items()})]
-    if n > 1:
-        for name in ("permutation", "wilcoxon"):
-            pair = paired_test(a, b, name)
-            assert 0 < pair.p <= 1
-            intervals.append(pair.interval)
-    for interval in intervals:
-        assert not math.isinf(interval.value)
-        assert not math.isinf(interval.low)
-        assert not math.isinf(interval.high)
-        assert math.isnan(interval.low) or interval.low <= interval.value <= interval.high
-    found = smallest_detectable_difference([v[0] for v in a.values()])
-    assert math.isnan(found) or 0 <= found < math.inf
 
 
 @pytest.mark.parametrize(
@@ -434,9 +380,6 @@ def test_any_finite_values_give_finite_or_absent_numbers_quietly(no_warning, see
         ([math.inf] * 4, math.inf),
         ([1.0, math.inf], math.inf),
         ([-math.inf, 1.0, 2.0, math.inf], 1.5),
-        ([1.7e308, 1.7e308], 1.7e308),
-        ([1.5e308, 1.7e308], 1.6e308),
-        ([-1.7e308, 1.7e308], 0.0),
         ([-math.inf], -math.inf),
     ],
 )

@@ -34,36 +34,26 @@ class PersonCrop:
         """[H, W] or [H, W, C] of the whole image -> [height, width(, C)] of the crop: area means when it shrinks,
         bilinear when it grows. Outside the image `fill` holds. 8-bit stays 8-bit, anything else becomes float32."""
         image = image if image.dtype == np.uint8 else image.astype(np.float32)
-        window = self._window(image, fill)
-        shrinks = self.height < self.window_height
-        return cv2.resize(window, (self.width, self.height), interpolation=_INTER[shrinks])
+        window = np.full((self.window_height, self.window_width, *image.shape[2:]), fill, image.dtype)
+        whole, own = self._overlap(*image.shape[:2])
+        window[own] = image[whole]
+        how = cv2.INTER_AREA if self.height < self.window_height else cv2.INTER_LINEAR
+        return cv2.resize(window, (self.width, self.height), interpolation=how)
 
     def paste(self, crop: NDArray[np.float32], image: NDArray[np.float32]) -> NDArray[np.float32]:
         """A copy of `image` [H, W(, C)] whose window shows `crop` [height, width(, C)], brought back to its size."""
-        grows = self.window_height > self.height
-        size = (self.window_width, self.window_height)
-        back = cv2.resize(
-            np.asarray(crop, np.float32), size, interpolation=cv2.INTER_CUBIC if grows else cv2.INTER_AREA
-        )
+        how = cv2.INTER_CUBIC if self.window_height > self.height else cv2.INTER_AREA
+        back = cv2.resize(np.asarray(crop, np.float32), (self.window_width, self.window_height), interpolation=how)
         out = image.copy()
-        rows, cols = self._inside(*image.shape[:2])
-        out[rows, cols] = back[rows.start - self.y0 : rows.stop - self.y0, cols.start - self.x0 : cols.stop - self.x0]
+        whole, own = self._overlap(*image.shape[:2])
+        out[whole] = back[own]
         return out
 
-    def _inside(self, height: int, width: int) -> tuple[slice, slice]:
-        """The rows and columns of the image that the window covers."""
-        return _overlap(self.y0, self.window_height, height), _overlap(self.x0, self.window_width, width)
-
-    def _window(self, image: NDArray, fill: float) -> NDArray:
-        rows, cols = self._inside(*image.shape[:2])
-        out = np.full((self.window_height, self.window_width, *image.shape[2:]), fill, image.dtype)
-        out[rows.start - self.y0 : rows.stop - self.y0, cols.start - self.x0 : cols.stop - self.x0] = image[
-            rows, cols
-        ]
-        return out
-
-
-_INTER = {True: cv2.INTER_AREA, False: cv2.INTER_LINEAR}
+    def _overlap(self, height: int, width: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+        """The rows and columns of the image that the window covers, and the same in the window."""
+        rows, cols = _overlap(self.y0, self.window_height, height), _overlap(self.x0, self.window_width, width)
+        own = slice(rows.start - self.y0, rows.stop - self.y0), slice(cols.start - self.x0, cols.stop - self.x0)
+        return (rows, cols), own
 
 
 def _overlap(start: int, length: int, limit: int) -> slice:

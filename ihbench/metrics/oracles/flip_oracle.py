@@ -10,6 +10,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from ihbench.metrics.oracles.oracle import unit
+
 DEFAULT_PPD = 3840 * math.pi / 180  # 0.7 m from a screen of 3840 px and 0.7 m
 
 _XYZ_OF_RGB = np.array(
@@ -31,7 +33,7 @@ def flip_oracle(
     ppd: float = DEFAULT_PPD,
 ) -> float:
     """Mean of the FLIP map over the frame, or over the mask after painting both images outside it."""
-    pred, truth = _unit(pred), _unit(truth)
+    pred, truth = unit(pred), unit(truth)
     if mask is not None:
         pred[~mask] = truth[~mask] = background
     if not (np.isfinite(pred).all() and np.isfinite(truth).all()):
@@ -47,7 +49,7 @@ def flip_map_oracle(
     ppd: float = DEFAULT_PPD,
 ) -> NDArray[np.float64]:
     """[H, W] FLIP of two finite images [H, W, 3]."""
-    x, y = (_opponent(np.clip(_unit(image), 0, 1)) for image in (pred, truth))
+    x, y = (_opponent(np.clip(unit(image), 0, 1)) for image in (pred, truth))
     color = _color_difference(_lab_with_hunt(_blurred(x, ppd)), _lab_with_hunt(_blurred(y, ppd)))
     feature = _feature_difference((x[..., 0] + 16) / 116, (y[..., 0] + 16) / 116, ppd)
     return color ** (1 - feature)
@@ -111,9 +113,7 @@ def _feature_difference(x: NDArray, y: NDArray, ppd: float) -> NDArray:
     edge, point = _balanced(-columns * gauss), _balanced((columns**2 / sigma**2 - 1) * gauss)
     differences = []
     for kernel in (edge, point):
-        magnitudes = [
-            np.hypot(_filtered_contrast(image, kernel), _filtered_contrast(image, kernel.T)) for image in (x, y)
-        ]
+        magnitudes = [np.hypot(_filtered(image, kernel, True), _filtered(image, kernel.T, True)) for image in (x, y)]
         differences.append(np.abs(magnitudes[0] - magnitudes[1]))
     return np.sqrt(np.maximum(*differences) / math.sqrt(2))
 
@@ -123,28 +123,15 @@ def _balanced(kernel: NDArray) -> NDArray:
     return np.where(kernel > 0, kernel / kernel[kernel > 0].sum(), kernel / -kernel[kernel < 0].sum())
 
 
-def _filtered(image: NDArray, kernel: NDArray) -> NDArray:
-    """out[i, j] = sum of kernel[a, b] image[i + a - radius, j + b - radius]."""
-    radius, (height, width) = len(kernel) // 2, image.shape
-    padded = np.pad(image, radius, "edge")
-    out = np.zeros(image.shape)
-    for i, j in np.ndindex(kernel.shape):
-        out += kernel[i, j] * padded[i : i + height, j : j + width]
-    return out
+def _filtered(image: NDArray, kernel: NDArray, contrast: bool = False) -> NDArray:
+    """out[i, j] = sum of kernel[a, b] image[i + a - radius, j + b - radius].
 
-
-def _filtered_contrast(image: NDArray, kernel: NDArray) -> NDArray:
-    """`_filtered` for weights that sum to 0, of what a pixel has more than the middle one.
-
-    That is the same number, and on a flat patch exactly 0: a feature difference of 1e-17 would weigh 3e-9.
+    For weights that sum to 0 `contrast` takes what a pixel has more than the middle one. That is the same number, and
+    on a flat patch exactly 0: a feature difference of 1e-17 would weigh 3e-9.
     """
     radius, (height, width) = len(kernel) // 2, image.shape
     padded = np.pad(image, radius, "edge")
     out = np.zeros(image.shape)
     for i, j in np.ndindex(kernel.shape):
-        out += kernel[i, j] * (padded[i : i + height, j : j + width] - image)
+        out += kernel[i, j] * (padded[i : i + height, j : j + width] - (image if contrast else 0))
     return out
-
-
-def _unit(image: NDArray) -> NDArray[np.float64]:
-    return image / 255.0 if image.dtype == np.uint8 else image.astype(np.float64)

@@ -16,7 +16,7 @@ def psnr_oracle(
     mask: NDArray[np.bool_] | None = None,  # [H, W]; None is the whole frame
 ) -> float:
     """PSNR in dB of [H, W, C] images, float with peak 1 or uint8; exactly rounded sums."""
-    pred, truth = _unit(pred), _unit(truth)
+    pred, truth = unit(pred), unit(truth)
     errors = []
     for i, j in np.ndindex(pred.shape[:2]):
         if mask is None or mask[i, j]:
@@ -52,7 +52,7 @@ def ssim_oracle(
 ) -> float:
     """Mean of the SSIM map over the frame without `crop` pixels at its edges, or over the mask within it, after
     painting both images outside the mask (not for `background=None`)."""
-    pred, truth = _unit(pred), _unit(truth)
+    pred, truth = unit(pred), unit(truth)
     if mask is not None and background is not None:
         pred, truth = pred.copy(), truth.copy()
         pred[~mask] = truth[~mask] = background
@@ -84,7 +84,7 @@ def ssim_map_oracle(
 
     Population moments, or those times n/(n-1). Edges: "mirror" d c b a | a b c d, "reflect" d c b | a b c d, "zero".
     """
-    pred, truth = _unit(pred), _unit(truth)
+    pred, truth = unit(pred), unit(truth)
     height, width, channels = pred.shape
     radius = window // 2
     offsets = range(-radius, radius + 1)
@@ -110,5 +110,8 @@ def _gauss(dy: int, dx: int, sigma: float) -> float:
     return math.exp(-(dy * dy + dx * dx) / (2 * sigma * sigma))
 
 
-def _unit(image: NDArray) -> NDArray[np.float64]:
+def unit(
+    image: NDArray,  # [...] uint8, or float with peak 1
+) -> NDArray[np.float64]:
+    """[...] the image in float64 with peak 1."""
     return image / 255.0 if image.dtype == np.uint8 else image.astype(np.float64)

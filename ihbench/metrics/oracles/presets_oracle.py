@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.metrics.oracles.flip_oracle import flip_oracle
-from ihbench.metrics.oracles.oracle import psnr_channels_oracle, psnr_oracle, ssim_map_oracle, ssim_oracle
+from ihbench.metrics.oracles.oracle import psnr_channels_oracle, psnr_oracle, ssim_map_oracle, ssim_oracle, unit
 
 Image = NDArray[np.float64]  # [H, W, 3]
 Masks = Mapping[str, NDArray[np.bool_]]
@@ -36,7 +36,7 @@ def preset_oracle(
 
 
 def _ihbench(pred: NDArray, truth: NDArray, masks: Masks, background: NDArray, lpips: Distance) -> Scores:
-    x, y = (np.floor(np.clip(_unit(image), 0, 1) * 255 + 0.5) / 255 for image in (pred, truth))
+    x, y = (np.floor(np.clip(unit(image), 0, 1) * 255 + 0.5) / 255 for image in (pred, truth))
     white = bool((background == 1).all())
     out = {}
     for region, mask in masks.items():
@@ -56,7 +56,7 @@ def _ihbench(pred: NDArray, truth: NDArray, masks: Masks, background: NDArray, l
 
 def _neuralbody(pred: NDArray, truth: NDArray, masks: Masks, background: NDArray, lpips: Distance) -> Scores:
     box = masks["box+0.05"]
-    x, y = _unit(pred), _unit(truth)
+    x, y = unit(pred), unit(truth)
     a, b = _cut(_painted(x, box, background), _painted(y, box, background), box)
     return {
         "psnr/neuralbody-pooled/range1/box+0.05/v1": psnr_oracle(x, y, box),
@@ -88,8 +88,8 @@ def _occnerf(pred: NDArray, truth: NDArray, masks: Masks, background: NDArray, l
 
 
 def _gauhuman(pred: NDArray, truth: NDArray, masks: Masks, background: NDArray, lpips: Distance) -> Scores:
-    x = np.clip(_unit(_painted(pred, masks["box+0.05"], background)), 0, 1)
-    y = np.clip(_unit(truth), 0, 1)
+    x = np.clip(unit(_painted(pred, masks["box+0.05"], background)), 0, 1)
+    y = np.clip(unit(truth), 0, 1)
     return {
         "psnr/gauhuman-channels/range1/full/v1": psnr_channels_oracle(x, y),
         "ssim/gauhuman-gauss11-zero/range1/full/v1": ssim_oracle(x, y, border="zero"),
@@ -98,7 +98,7 @@ def _gauhuman(pred: NDArray, truth: NDArray, masks: Masks, background: NDArray, 
 
 
 def _3dgs_avatar_zju(pred: NDArray, truth: NDArray, masks: Masks, background: NDArray, lpips: Distance) -> Scores:
-    x, y = _unit(pred), _unit(truth)
+    x, y = unit(pred), unit(truth)
     return {
         "psnr/3dgs-avatar-zju-pooled/range1/full/v1": psnr_oracle(x, y),
         "ssim/3dgs-avatar-zju-uniform7/range2/full/v1": ssim_oracle(x, y, crop=3, **UNIFORM),
@@ -107,7 +107,7 @@ def _3dgs_avatar_zju(pred: NDArray, truth: NDArray, masks: Masks, background: ND
 
 
 def _instantavatar(pred: NDArray, truth: NDArray, masks: Masks, background: NDArray, lpips: Distance) -> Scores:
-    x, y = (np.floor(np.clip(_unit(image), 0, 1) * 255 + 0.5) / 255 for image in (pred, truth))
+    x, y = (np.floor(np.clip(unit(image), 0, 1) * 255 + 0.5) / 255 for image in (pred, truth))
     return {
         "psnr/instantavatar-pooled/range1/full/v1": psnr_oracle(x, y),
         "ssim/instantavatar-gauss11-crop5/range1/full/v1": ssim_oracle(x, y, crop=5, border="reflect"),
@@ -118,7 +118,7 @@ def _instantavatar(pred: NDArray, truth: NDArray, masks: Masks, background: NDAr
 
 def _gtu_mask(pred: NDArray, truth: NDArray, masks: Masks, background: NDArray, lpips: Distance) -> Scores:
     mask = masks["body"]
-    x, y = (_unit(image) * mask[..., None] for image in (pred, truth))
+    x, y = (unit(image) * mask[..., None] for image in (pred, truth))
     values = ssim_map_oracle(x, y, border="reflect")[5:-5, 5:-5]
     inside = values[mask[5:-5, 5:-5]].ravel()
     area = 10 * math.log10(mask.sum() / mask.size)
@@ -128,10 +128,6 @@ def _gtu_mask(pred: NDArray, truth: NDArray, masks: Masks, background: NDArray, 
         "ssim/gtu-mask-gauss11-crop5/range1/body/v1": math.fsum(inside) / len(inside),
         "lpips/gtu-mask-alex/[-1,1]/body/v1": lpips("alex", "[-1,1]", *grey),
     }
-
-
-def _unit(image: NDArray) -> Image:
-    return image / 255.0 if image.dtype == np.uint8 else image.astype(np.float64)
 
 
 def _painted(image: NDArray, mask: NDArray[np.bool_], background: NDArray) -> NDArray:

@@ -30,13 +30,12 @@ class MeanColour:
 
     def inpaint(self, views: list[CropView], progress: Progress) -> list[NDArray[np.uint8]]:
         everybody = mean_person(views)
-        out = []
-        with progress.task("filling with the mean colour", len(views)) as task:
-            for view in views:
-                own = mean_person([view]) if view.person.any() else everybody
-                out.append(view.completed(on_background(view.body, own, self.background)))
-                task.advance()
-        return out
+
+        def paint(view: CropView) -> Image:
+            own = mean_person([view]) if view.person.any() else everybody
+            return on_background(view.body, own, self.background)
+
+        return _filled(views, progress, "with the mean colour", paint)
 
 
 @dataclass(frozen=True)
@@ -47,17 +46,13 @@ class ImageFill:
     paint: Callable[[Image, NDArray[np.bool_]], Image]  # image [S, W, 3], unknown [S, W] -> painted [S, W, 3]
 
     def inpaint(self, views: list[CropView], progress: Progress) -> list[Image]:
-        out = []
-        with progress.task(f"filling by {self.name}", len(views)) as task:
-            for view in views:
-                image = view.image
-                if view.unknown.any():
-                    # with no known pixel the image stays as it is: grey
-                    blank = np.where(view.unknown[..., None], np.uint8(GREY), image)
-                    image = view.completed(blank if view.unknown.all() else self.paint(blank, view.unknown))
-                out.append(image)
-                task.advance()
-        return out
+        def paint(view: CropView) -> Image:
+            # with no known pixel the image stays as it is: grey
+            blank = np.where(view.unknown[..., None], np.uint8(GREY), view.image)
+            some = view.unknown.any() and not view.unknown.all()
+            return self.paint(blank, view.unknown) if some else blank
+
+        return _filled(views, progress, f"by {self.name}", paint)
 
 
 def _opencv(method: int, image: Image, unknown: NDArray[np.bool_]) -> Image:
@@ -110,16 +105,24 @@ class PushPull:
         from ihbench.diffusion.crops.push_pull import push_pull
 
         everybody = mean_person(views)
-        out = []
-        with progress.task("filling by push-pull", len(views)) as task:
-            for view in views:
-                image = torch.from_numpy(view.image).movedim(-1, 0)[None].float()
-                known = torch.from_numpy(view.person)[None, None].float()
-                colours = push_pull(image, known)[0].movedim(0, -1).numpy()[view.body]
-                own = colours if view.person.any() else everybody
-                out.append(view.completed(on_background(view.body, own, self.background)))
-                task.advance()
-        return out
+
+        def paint(view: CropView) -> Image:
+            image = torch.from_numpy(view.image).movedim(-1, 0)[None].float()
+            known = torch.from_numpy(view.person)[None, None].float()
+            colours = push_pull(image, known)[0].movedim(0, -1).numpy()[view.body]
+            return on_background(view.body, colours if view.person.any() else everybody, self.background)
+
+        return _filled(views, progress, "by push-pull", paint)
+
+
+def _filled(views: list[CropView], progress: Progress, how: str, paint: Callable[[CropView], Image]) -> list[Image]:
+    """Every view, completed by what is painted of it."""
+    out = []
+    with progress.task(f"filling {how}", len(views)) as task:
+        for view in views:
+            out.append(view.completed(paint(view)))
+            task.advance()
+    return out
 
 
 def mean_person(views: list[CropView]) -> NDArray[np.float64]:

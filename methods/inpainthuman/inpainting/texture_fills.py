@@ -35,23 +35,38 @@ class TemporalCopy:
     background: tuple[float, float, float]  # RGB in [0, 1]
     texels: int = 256  # of the texture's side
     name = "temporal"
+    mirrored = False
 
     def inpaint(self, views: list[CropView], progress: Progress) -> list[NDArray[np.uint8]]:
-        return _inpaint(views, self.body, self.background, self.texels, False, progress)
+        texels = texel_table(self.body, self.texels)
+        seen, targets, pixels = [], [], []
+        with progress.task("reading the texture", len(views)) as task:
+            for view in views:
+                seen.append(_seen(view, self.body, texels))
+                number = pixel_texels(view, self.body, texels)
+                pixels.append(view.unknown & (number >= 0))
+                targets.append(number[pixels[-1]])
+                task.advance()
+        if self.mirrored:
+            other = mirrored_texels(self.body, self.texels)
+            targets = [other[texel] for texel in targets]
+        index = np.array([view.index for view in views], np.int64)
+        borrowed = nearest_colours(targets, seen, index, len(texels.index))
+        means = _part_means(views)
+        out = []
+        for view, hidden, (colour, nearest) in zip(views, pixels, borrowed, strict=True):
+            fill = np.where(nearest[:, None], colour, means[smpl_parts(view.parts)[hidden]])
+            out.append(view.completed(on_background(hidden, fill, self.background)))
+        return out
 
 
 @dataclass(frozen=True)
-class MirroredTexture:
+class MirroredTexture(TemporalCopy):
     """As `TemporalCopy`, but with the texel on the other side of the body: the colour of the left hand for the right.
     The view itself counts as the nearest."""
 
-    body: Body
-    background: tuple[float, float, float]  # RGB in [0, 1]
-    texels: int = 256  # of the texture's side
     name = "mirror"
-
-    def inpaint(self, views: list[CropView], progress: Progress) -> list[NDArray[np.uint8]]:
-        return _inpaint(views, self.body, self.background, self.texels, True, progress)
+    mirrored = True
 
 
 @lru_cache(maxsize=8)
@@ -59,35 +74,6 @@ def mirrored_texels(body: Body, resolution: int) -> NDArray[np.int32]:
     """[N] for each texel the one nearest to its rest-pose point reflected at x = 0. No symmetric mesh is needed."""
     points = texel_table(body, resolution).interpolate(body.v_template, body.faces)
     return np.asarray(KDTree(points).query(points * [-1, 1, 1])[1], np.int32)
-
-
-def _inpaint(
-    views: list[CropView],
-    body: Body,
-    background: tuple[float, float, float],
-    resolution: int,
-    mirrored: bool,
-    progress: Progress,
-) -> list[NDArray[np.uint8]]:
-    texels = texel_table(body, resolution)
-    seen, targets, pixels = [], [], []
-    with progress.task("reading the texture", len(views)) as task:
-        for view in views:
-            seen.append(_seen(view, body, texels))
-            number = pixel_texels(view, body, texels)
-            pixels.append(view.unknown & (number >= 0))
-            targets.append(number[pixels[-1]])
-            task.advance()
-    if mirrored:
-        other = mirrored_texels(body, resolution)
-        targets = [other[texel] for texel in targets]
-    borrowed = nearest_colours(targets, seen, np.array([view.index for view in views], np.int64), len(texels.index))
-    means = _part_means(views)
-    out = []
-    for view, hidden, (colour, nearest) in zip(views, pixels, borrowed, strict=True):
-        fill = np.where(nearest[:, None], colour, means[smpl_parts(view.parts)[hidden]])
-        out.append(view.completed(on_background(hidden, fill, background)))
-    return out
 
 
 def nearest_colours(

@@ -84,16 +84,18 @@ def main(argv: list[str]) -> int:
 
 def table(of_runs: Sequence[tuple[str, Sequence[CeilingRow]]], title: str) -> list[Block]:
     """A row for each painting, means over scenes, differences to stage 1 paired over scenes."""
+    from ihbench.metrics.identity import METRICS
+
     regions = [region for region in REGIONS if any(math.isfinite(_mean(rows[0], region)) for _, rows in of_runs)]
     heads = [text for region in regions for text in (f"PSNR {region} ↑", "over stage 1")]
     lines = []
     for k, row in enumerate(of_runs[0][1]):
         quality = _average([(scene, rows[k].painted_psnr) for scene, rows in of_runs])
-        cells = [_decibels(_over_scenes(quality))]
+        cells = [METRICS["psnr"].text(_over_scenes(quality))]
         for region in regions:
             own = _average([(scene, _mean(rows[k], region)) for scene, rows in of_runs])
             first = _average([(scene, _mean(rows[0], region)) for scene, rows in of_runs])
-            cells += [_decibels(_over_scenes(own)), "" if row.truth is None else _gain(own, first)]
+            cells += [METRICS["psnr"].text(_over_scenes(own)), "" if row.truth is None else _gain(own, first)]
         lines.append((row.name, *cells))
     return [
         Heading(3, f"What a better painter would give: {title}"),
@@ -103,10 +105,7 @@ def table(of_runs: Sequence[tuple[str, Sequence[CeilingRow]]], title: str) -> li
 
 def _mean(row: CeilingRow, region: str) -> float:
     """PSNR of the first preset in a region; NaN where the protocol or the scene has none."""
-    for identity, value in row.scores.items():
-        if identity.metric == "psnr" and identity.region == region:
-            return value
-    return math.nan
+    return next((v for i, v in row.scores.items() if (i.metric, i.region) == ("psnr", region)), math.nan)
 
 
 def _average(values: Sequence[tuple[str, float]]) -> dict[str, float]:
@@ -132,12 +131,6 @@ def _gain(own: Mapping[str, float], first: Mapping[str, float]) -> str:
 
     pair = paired_test({s: own[s] for s in both}, {s: first[s] for s in both}).interval
     return f"{pair.value:+.2f} [{pair.low:+.2f}, {pair.high:+.2f}]"
-
-
-def _decibels(value: float) -> str:
-    from ihbench.metrics.identity import METRICS
-
-    return METRICS["psnr"].text(value)
 
 
 def _numbers(result: RunResult, rows: Sequence[CeilingRow]) -> dict[str, object]:

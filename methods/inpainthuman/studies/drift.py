@@ -71,8 +71,7 @@ def identity_drift(views: Sequence[CropView], completed: Sequence[Image], body: 
     seen, painted = _sightings(views, completed, body, texels)
     (rgb, delta_e), n = _from_seen(painted, seen, len(table.index), (_rgb_distance, _delta_e))
     (rgb_floor, delta_e_floor), _ = _from_seen(seen, seen, len(table.index), (_rgb_distance, _delta_e))
-    patches_seen = [patch_texture(*sighting, table) for sighting in seen]
-    patches_painted = [patch_texture(*sighting, table) for sighting in painted]
+    patches_seen, patches_painted = ([patch_texture(*one, table) for one in shown] for shown in (seen, painted))
     (texture,), n_patches = _from_seen(patches_painted, patches_seen, patch_count(texels), (_euclidean,))
     (texture_floor,), _ = _from_seen(patches_seen, patches_seen, patch_count(texels), (_euclidean,))
     reasons = [
@@ -146,12 +145,12 @@ def _rgb_distance(a: NDArray, b: NDArray) -> NDArray:
     return np.abs(a - b).mean(1)
 
 
-def _delta_e(a: NDArray, b: NDArray) -> NDArray:
-    return np.linalg.norm(lab(a) - lab(b), axis=1)
-
-
 def _euclidean(a: NDArray, b: NDArray) -> NDArray:
     return np.linalg.norm(a - b, axis=1)
+
+
+def _delta_e(a: NDArray, b: NDArray) -> NDArray:
+    return _euclidean(lab(a), lab(b))
 
 
 def _from_seen(
