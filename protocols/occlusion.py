@@ -77,10 +77,13 @@ def _narrowest_band(
     return mid, 2 * int(np.flatnonzero(held >= fraction * total)[0])
 
 
+def _columns(mid: int, width: int, request: OcclusionRequest) -> Mask:
+    """[W] True in [mid - width//2, mid + width//2)."""
+    return np.abs(np.arange(request.width) + 0.5 - mid) < width // 2
+
+
 def _strip(rule: str, mid: int, width: int, request: OcclusionRequest) -> Occlusion:
-    columns: Mask = np.zeros(request.width, bool)
-    columns[max(0, mid - width // 2) : max(0, mid + width // 2)] = True
-    hidden = np.broadcast_to(columns, (request.height, request.width))
+    hidden = np.broadcast_to(_columns(mid, width, request), (request.height, request.width))
     return Occlusion(rule, lambda frame: hidden, {"mid": mid, "width": width})
 
 
@@ -94,42 +97,36 @@ def central_band(request: OcclusionRequest) -> Occlusion:
 
     def hidden(frame: int, person: Mask) -> Mask:  # [H, W] both, original image
         mid, width = _narrowest_band(person.sum(0), request.rule.fraction)
-        columns = np.zeros(request.width, bool)
-        columns[max(0, mid - width // 2) : mid + width // 2] = True
-        return np.broadcast_to(columns, person.shape)
+        return np.broadcast_to(_columns(mid, width, request), person.shape)
 
     return _per_frame("central-band", request, hidden)
 
 
 def side(request: OcclusionRequest) -> Occlusion:
     """Everything left of a column, in every frame the one that hides at least `fraction` of the person."""
-
-    def hidden(frame: int, person: Mask) -> Mask:  # [H, W] both, original image
-        stop = _first_share(person.sum(0), request.rule.fraction)
-        return np.broadcast_to(np.arange(request.width) < stop, person.shape)
-
-    return _per_frame("side", request, hidden)
+    return _up_to("side", request, 0)
 
 
 def upper_half(request: OcclusionRequest) -> Occlusion:
     """Everything above a row, in every frame the one that hides at least `fraction` of the person (a half by
     default)."""
-
-    def hidden(frame: int, person: Mask) -> Mask:  # [H, W] both, original image
-        stop = _first_share(person.sum(1), request.rule.fraction)
-        return np.broadcast_to((np.arange(request.height) < stop)[:, None], person.shape)
-
-    return _per_frame("upper-half", request, hidden)
+    return _up_to("upper-half", request, 1)
 
 
 def lower_half(request: OcclusionRequest) -> Occlusion:
     """Everything below a row, as a table before the person; in every frame at least `fraction` of them."""
+    return _up_to("lower-half", request, 1, step=-1)
+
+
+def _up_to(rule: str, request: OcclusionRequest, axis: int, step: int = 1) -> Occlusion:
+    """The first columns (axis 0) or rows (1), with step -1 the last ones."""
 
     def hidden(frame: int, person: Mask) -> Mask:  # [H, W] both, original image
-        stop = _first_share(person.sum(1)[::-1], request.rule.fraction)
-        return np.broadcast_to((np.arange(request.height) >= request.height - stop)[:, None], person.shape)
+        counts = person.sum(axis)[::step]
+        line = np.arange(len(counts)) < _first_share(counts, request.rule.fraction)
+        return np.broadcast_to(np.expand_dims(line[::step], axis), person.shape)
 
-    return _per_frame("lower-half", request, hidden)
+    return _per_frame(rule, request, hidden)
 
 
 def blocks(request: OcclusionRequest) -> Occlusion:

@@ -71,12 +71,6 @@ class SilhouetteFinder(ABC):
         """[S, W] the person, looked at where it is undecided; None where the posed body must decide."""
 
 
-def silhouette_iou(found: NDArray[np.bool_], truth: NDArray[np.bool_]) -> float:
-    """Intersection over union of two masks [...]; 1 for two empty ones."""
-    union = np.count_nonzero(found | truth)
-    return 1.0 if union == 0 else np.count_nonzero(found & truth) / union
-
-
 class _OnBackground(SilhouetteFinder):
     def __init__(self, background: tuple[float, float, float]):
         self.background = 255 * np.array(background, np.float32)

@@ -39,6 +39,7 @@ from ihbench.stress.drawn_capture import (
     SIZE,
     WHITE,
     DrawnCapture,
+    Edit,
     a_camera,
     a_pose,
     small_protocol,
@@ -56,12 +57,8 @@ EVERYTHING = (SIZE // 2, 2 * SIZE)  # mid and width of a strip over the whole im
 FRAMES = 5
 
 
-def empty(_camera: int, _frame: int, pixels: NDArray) -> NDArray:
-    return np.zeros_like(pixels)
-
-
-def whole(_camera: int, _frame: int, pixels: NDArray) -> NDArray:
-    return np.ones_like(pixels)
+def filled(value: bool) -> Edit:
+    return lambda camera, frame, pixels: np.full_like(pixels, value)
 
 
 protocol_with = partial(small_protocol, n_frames=FRAMES)
@@ -111,7 +108,7 @@ def _not_opened(words: str, change: Mapping[str, object], **of_capture: Any) -> 
 
 
 def _nobody_to_score() -> Answer:
-    scores = _scores(_scorer(replace(person(), edit_silhouette=empty), rule="none"))
+    scores = _scores(_scorer(replace(person(), edit_silhouette=filled(False)), rule="none"))
     return Answer(scores["psnr/pooled/range1/body/v1"].reason, "empty region")
 
 
@@ -139,10 +136,6 @@ def _one_frame() -> Answer:
     scene = open_scene(turning_capture(1), small_protocol(n_frames=1, rule="none"))
     measure = measure_scene(scene)
     return Answer([len(scene.train), measure.motion_deg, measure.turn_deg], [1, 0, 0])
-
-
-def _short_capture() -> Answer:
-    return Answer(fitness(person(), small_protocol(n_frames=FRAMES + 1)), "has 5 frames, needs frame 5")
 
 
 def _behind_camera() -> Answer:
@@ -192,7 +185,7 @@ def _partition() -> Answer:
 
 def _full_silhouette() -> Answer:
     """A silhouette that is the whole image: every pixel gets a label from the nearest body pixel."""
-    scorer = _scorer(replace(person(), edit_silhouette=whole), rule="none")
+    scorer = _scorer(replace(person(), edit_silhouette=filled(True)), rule="none")
     return Answer(sum(next(_regions(scorer, *PARTS))), 1)
 
 
@@ -292,13 +285,6 @@ def _damaged_state(cut: int) -> Answer:
     return Answer(f"lost {lost}: {said}", "lost True: ['checkpoint stage is damaged")
 
 
-def _bad_mask_pixels() -> Answer:
-    """Three-state masks hold three states: any other number would be nobody's pixel."""
-    scene = usual().scene
-    states = np.unique(np.concatenate([np.unique(view.mask) for view in scene.train]))
-    return Answer(states, [int(state) for state in MaskState])
-
-
 picture = partial(read_image, background=WHITE)
 
 
@@ -310,7 +296,7 @@ _exact = partial(_data, unit="absolute", tolerance=0, why=EXACT)
 
 CASES = [
     _refused("nobody-to-hide", "a strip for frames without a person",
-             partial(_not_opened, "no person pixel in any", {}, edit_silhouette=empty)),
+             partial(_not_opened, "no person pixel in any", {}, edit_silhouette=filled(False))),
     _refused("nobody-to-score", "test frames without a person", _nobody_to_score),
     _counted("all-hidden", "a strip over the whole image", _all_hidden),
     _counted("all-hidden-regions", "every training frame hidden", _all_hidden_regions),
@@ -324,7 +310,8 @@ CASES = [
              partial(_not_opened, "training needs camera index 9", {"train.camera": 9})),
     _refused("frames-missing", "frames that are not there",
              partial(_not_opened, "has 5 frames", {"test.frames": Span(0, 9, 1)})),
-    _refused("short-capture", "a capture a frame too short is told apart from a fit one", _short_capture),
+    _refused("short-capture", "a capture a frame too short is told apart from a fit one",
+             lambda: Answer(fitness(person(), small_protocol(n_frames=FRAMES + 1)), "has 5 frames, needs frame 5")),
     _counted("body-behind-camera", "a body behind the training camera", _behind_camera),
     _counted("camera-in-body", "a training camera inside the body", _camera_in_body),
     _data("motion-whole-turns", "axis-angles that differ by whole turns", _whole_turn, "absolute", 1e-5,
@@ -348,7 +335,8 @@ CASES = [
     _data("prediction-nan-elsewhere", "a NaN outside the body", _nan_elsewhere, "absolute", 1e-14,
           "a region's mean may be taken from the frame's where that is finite: the sum has another order"),
     _counted("calibration-nobody-visible", "calibration rows where nobody was ever visible", _no_color),
-    _exact("mask-states", "the states of training masks", _bad_mask_pixels),
+    _exact("mask-states", "the states of training masks",
+           lambda: Answer(np.unique([view.mask for view in usual().scene.train]), list(map(int, MaskState)))),
     _refused("pickle-calls", "a pickle that calls a function",
              partial(_read, load_pickle, "x.pkl", pickle.dumps(_Caller()), "eval")),
     _refused("pickle-cut", "a pickle that lost its end",

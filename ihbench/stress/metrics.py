@@ -48,6 +48,9 @@ def rectangle(rows: slice, columns: slice, height: int = 20, width: int = 18) ->
     return mask
 
 
+CORNER = rectangle(slice(19, 20), slice(0, 1))  # a pixel
+
+
 # ----------------------------------------------------------------------------------------------------
 # Condition numbers
 
@@ -89,8 +92,7 @@ def _against_oracle(metric: str, x: NDArray, y: NDArray, mask: NDArray[np.bool_]
 
 
 def _one_lsb_oracle(metric: str) -> Answer:
-    truth = texture(1, dtype=np.uint8)
-    pred = truth.copy()
+    pred, truth = texture(1, dtype=np.uint8), texture(1, dtype=np.uint8)
     pred[9, 9, 0] ^= 1
     return _against_oracle(metric, pred, truth)
 
@@ -117,13 +119,6 @@ def _green_and_blue() -> Answer:
     return Answer(flip(green, blue), 1.0)
 
 
-def _one_pixel_psnr() -> Answer:
-    x, y = texture(1), texture(2)
-    mask = rectangle(slice(19, 20), slice(0, 1))
-    expected = -10 * math.log10(math.fsum(np.square(x - y)[19, 0].tolist()) / 3)
-    return Answer(psnr(x, y, mask), expected)
-
-
 def _bad_inside(metric: str, bad: float) -> Answer:
     x = texture(1)
     x[5, 6, 1] = bad
@@ -133,7 +128,6 @@ def _bad_inside(metric: str, bad: float) -> Answer:
 def _bad_outside(metric: str, bad: float) -> Answer:
     x, y, mask = texture(1), texture(2), rectangle(slice(8, 20), slice(6, 18))
     clean = METRICS[metric](x, y, mask)
-    x = x.copy()
     x[7, 7, 1] = bad
     return Answer(METRICS[metric](x, y, mask), clean)
 
@@ -145,11 +139,6 @@ def _flat_on_black(level: float, expected: float, dtype: type = np.float64) -> A
 def _tiny_on_large(amplitude: float) -> tuple[NDArray, NDArray]:
     """Two patterns of this amplitude on a mean of 1."""
     return 1 - amplitude * (texture(1) > 0.5), 1 - amplitude * (texture(2) > 0.5)
-
-
-def _tiny_difference() -> Answer:
-    x, y = flat(1 - 2.0**-40), flat(1)
-    return Answer(psnr(x, y), 800 * math.log10(2), condition_of_psnr(x, y))
 
 
 def _training_ssim() -> Answer:
@@ -249,10 +238,12 @@ CASES = [
     *(_exact(f"{m}-empty-mask", "a region without a pixel",
              lambda m=m: Answer(METRICS[m](texture(1), texture(2), np.zeros((20, 18), np.bool_)), math.nan))
       for m in METRICS),
-    _metric("psnr-one-pixel-mask", "a region of one pixel in a corner", _one_pixel_psnr, "ulp", 4, CLOSED),
+    _metric("psnr-one-pixel-mask", "a region of one pixel in a corner",
+            lambda: Answer(psnr(texture(1), texture(2), CORNER), -10 * math.log10(
+                math.fsum(np.square(texture(1) - texture(2))[19, 0].tolist()) / 3)), "ulp", 4, CLOSED),
     *(
         _metric(f"{m}-one-pixel-mask", "a region of one pixel in a corner",
-                lambda m=m: _against_oracle(m, texture(1), texture(2), rectangle(slice(19, 20), slice(0, 1))),
+                lambda m=m: _against_oracle(m, texture(1), texture(2), CORNER),
                 "absolute", tolerance, why)
         for m, tolerance, why in (("ssim", 1e-12, ORACLE), ("flip", 1e-9, ORACLE_FLIP))
     ),
@@ -277,7 +268,9 @@ CASES = [
     _closed("psnr-float64-underflow", "an error of 1e-170, whose square float64 lacks",
             partial(_flat_on_black, 1e-170, 3400.0),
             known="squares of errors below 1e-162 are 0, and the images count as identical (inf)"),
-    _metric("psnr-cancellation", "every pixel off by 2^-40 on a mean of 1", _tiny_difference, "ulp", 64,
+    _metric("psnr-cancellation", "every pixel off by 2^-40 on a mean of 1",
+            lambda: Answer(psnr(flat(1 - 2.0**-40), flat(1)), 800 * math.log10(2),
+                           condition_of_psnr(flat(1 - 2.0**-40), flat(1))), "ulp", 64,
             "both differences are exact, whatever the condition number says"),
     *(
         _metric(f"ssim-tiny-variance-{a:g}", f"patterns of amplitude {a:g} on a mean of 1",

@@ -140,18 +140,12 @@ def _dilated(frame: Frame) -> Frame:
 
 def _shifted(frame: Frame) -> Frame:
     """All predictions half a pixel to the right and down: pixel centres at 0 taken for centres at 0.5."""
-
-    def move(image: Image) -> Image:
+    images = {}
+    for name, image in frame.images.items():
         padded = np.pad(image, ((1, 0), (1, 0), (0, 0)), "edge")
         total = padded[1:, 1:] + padded[:-1, 1:] + padded[1:, :-1] + padded[:-1, :-1]
-        return np.asarray(total / 4, np.float32)
-
-    return replace(frame, images={name: move(image) for name, image in frame.images.items()})
-
-
-def _in_floats() -> Preset:
-    """The headline preset without its rounding to 8 bits."""
-    return replace(find_preset("ihbench"), prepare=lambda pred, truth, *_: (as_float(pred), as_float(truth)))
+        images[name] = np.asarray(total / 4, np.float32)
+    return replace(frame, images=images)
 
 
 @dataclass(frozen=True)
@@ -164,22 +158,20 @@ class Ranking:
     background: Color = WHITE
 
 
-def headline(region: str = "body") -> Ranking:
-    return Ranking(field(), find_preset("ihbench"), region)
-
-
 def _under(name: str) -> tuple[Ranking, Ranking]:
     """The ranking that a choice is compared with, and the ranking under it."""
-    usual = headline()
+    headline = find_preset("ihbench")
+    usual = Ranking(field(), headline)
     if name in PRESETS:
         preset = find_preset(name)
         region = next(iter(preset.regions(["full"])))
-        before = headline(region if region in ("full", "body") else "box")
+        before = replace(usual, region=region if region in ("full", "body") else "box")
         return before, replace(before, preset=preset, region=region)
+    in_floats = replace(headline, prepare=lambda pred, truth, *_: (as_float(pred), as_float(truth)))
     changed = {
         "1-px mask dilation": lambda: replace(usual, frames=tuple(map(_dilated, usual.frames))),
         "0.5-px shift": lambda: replace(usual, frames=tuple(map(_shifted, usual.frames))),
-        "no 8-bit rounding": lambda: replace(usual, preset=_in_floats()),
+        "no 8-bit rounding": lambda: replace(usual, preset=in_floats),
         "black background": lambda: replace(usual, frames=field(BLACK), background=BLACK),
     }
     return usual, changed[name]()
