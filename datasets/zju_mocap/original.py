@@ -225,9 +225,13 @@ def _camera_field(cams: dict, key: str, path: Path) -> NDArray[np.float64]:
     shape = CAMERA_SHAPES[key]
     expected = f"expected cams[{key!r}] to be one array of shape {list(shape)} for each camera"
     try:
-        stacked = np.array([np.reshape(np.asarray(value, np.float64), shape) for value in cams[key]])
+        stacked = np.array([np.asarray(value, np.float64) for value in cams[key]])
     except (KeyError, TypeError, ValueError):
         raise BadInput(f"{path}: {expected}, found {described(cams.get(key))} of other contents") from None
+    if len(shape) == 1 and stacked.ndim == 3 and 1 in stacked.shape[1:]:
+        stacked = stacked.reshape(len(stacked), -1)
+    if stacked.shape[1:] != shape:
+        raise BadInput(f"{path}: {expected}, found {list(stacked.shape[1:])}")
     if not np.isfinite(stacked).all():
         raise BadInput(f"{path}: {expected}, found NaN or infinity in it")
     return stacked

@@ -86,7 +86,11 @@ def add_fitness(report: CopyReport, root: Path, body: Body | None, named: Path |
     """
     no_place = ""
     overlays = OVERLAYS if named is None else named
-    if overlays.resolve().is_relative_to(root.resolve()):
+    try:
+        inside = overlays.resolve().is_relative_to(root.resolve())
+    except FileNotFoundError:
+        inside, no_place = False, "none: the current folder is gone; name one with --overlays"
+    if inside:
         if named is not None:
             raise BadInput(f"--overlays {named}: lies in the data folder, which is never written to; name another")
         no_place = "none: the current folder is in the data folder, never written to; name one with --overlays"

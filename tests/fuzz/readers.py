@@ -35,7 +35,6 @@ from ihbench.files import atomic
 from ihbench.files.images import read_image
 from ihbench.files.safe_pickle import load_npy, load_pickle
 from ihbench.reports.lint.table_files import read_tables
-from ihbench.reports.paper.paper_numbers import paper_table
 from ihbench.scene.protocol import read_protocol
 from tests.bench.fake_capture import a_camera, a_pose
 from tests.fuzz.patience import TooLong, at_most
@@ -139,7 +138,6 @@ def readers() -> list[Reader]:
             lambda path: standin_mark(path.parent),
         ),
         Reader("p.toml", _copy("protocol", "zju_occ", "zju_occ.toml"), read_protocol),
-        Reader("paper_tables.toml", _write_paper_tables, partial(paper_table, "table1")),
         Reader("t.md", lambda path: path.write_text("| a | PSNR |\n|---|---|\n| x | **1.5** |\n"), read_tables),
         Reader("t.tex", lambda path: path.write_text(_TEX), read_tables),
         Reader("run.json", lambda path: atomic.write_json(path, {"a": [1, None, "nan"]}), atomic.read_json),
@@ -207,12 +205,6 @@ def _write_params(path: Path) -> None:
 
 def _copy(kind: str, name: str, file: str) -> Callable[[Path], Any]:
     return lambda path: path.write_bytes((registry.package_folder(kind, name) / file).read_bytes())
-
-
-def _write_paper_tables(path: Path) -> None:
-    from importlib.resources import files
-
-    path.write_bytes((files("ihbench.reports") / "paper/paper_tables.toml").read_bytes())
 
 
 def _write_state(path: Path) -> None:

@@ -88,7 +88,7 @@ def test_a_run_that_lies_in_the_same_folder_is_found_and_said_to_be(bench, manne
         ),
         (lambda record: record["identity"]["config"].update(brightness="x"), "--method.brightness 'x'"),
         (lambda record: record["identity"].update(method="gone"), "unknown method 'gone'"),
-        (lambda record: record["identity"].update(seed=2**70), "seed"),
+        (lambda record: record["identity"].update(seed=2**70), "a whole number of more than 64 bits"),
         (lambda record: record["identity"].update(scene="nobody"), "unknown scene 'nobody'"),
         (lambda record: record["about"].update(protocol={}), "recorded protocol"),
         (
