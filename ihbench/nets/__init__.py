@@ -1,0 +1,1 @@
+"""What several methods' networks are made of."""
