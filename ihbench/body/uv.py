@@ -65,6 +65,17 @@ def texel_table(body: Body, resolution: int) -> Texels:
     return texels
 
 
+def nearest_texels(
+    texels: Texels,
+    uv: Array,  # [N, 2], v up
+) -> NDArray[np.int64]:
+    """[N] numbers of the texels that lie nearest on the map, of those inside a chart."""
+    inside = texels.mask
+    column, row = np.clip(np.rint(map_coordinates(uv, texels.resolution)), 0, texels.resolution - 1).astype(int).T
+    number = np.cumsum(inside.ravel()) - 1
+    return number[nearest_on_chart(inside)[row, column]]
+
+
 def _barycentric(points: Array, triangles: Array) -> Array:
     """[N, 3] of points [N, 2] in triangles [N, 3, 2]: in double precision, where the z-buffer keeps single."""
     a = triangles[:, 0]

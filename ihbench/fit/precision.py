@@ -1,0 +1,60 @@
+"""Which precision the networks of a fit compute in: chosen by a measurement, once a process; the record says so."""
+
+from __future__ import annotations
+
+import time
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from functools import cache
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from ihbench.fit.precision_name import Precision
+
+WORTH_IT = 1.3  # times as fast, before half the digits are given up
+ROWS, WIDTH, ROUNDS = 8192, 128, 5
+DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+
+
+@dataclass(frozen=True)
+class Computed:
+    """The precision that a fit's networks compute in."""
+
+    kind: ClassVar[str] = "precision"
+    precision: str
+    reason: str
+
+
+@cache
+def bfloat16_speed(device: str) -> float:
+    """How many times faster a small network learns in bfloat16 than in float32 there; the best of a few rounds."""
+    network = nn.Sequential(nn.Linear(WIDTH, WIDTH), nn.ReLU(), nn.Linear(WIDTH, WIDTH)).to(device)
+    rows = torch.ones(ROWS, WIDTH, device=device)
+
+    def seconds(dtype: torch.dtype) -> float:
+        start = time.perf_counter()
+        with autocast(device, dtype):
+            out: Tensor = network(rows)
+        torch.autograd.grad(out.sum(), list(network.parameters()))
+        if device.startswith("cuda"):
+            torch.cuda.synchronize(device)
+        return time.perf_counter() - start
+
+    best = {dtype: min(seconds(dtype) for _ in range(ROUNDS)) for dtype in (torch.float32, torch.bfloat16)}
+    return best[torch.float32] / best[torch.bfloat16]
+
+
+def choose(wanted: Precision, device: str) -> Computed:
+    """What was asked for, or with `auto` what a measurement on this machine says."""
+    if wanted != "auto":
+        return Computed(wanted, "asked for")
+    speed = bfloat16_speed(device)
+    name = "bfloat16" if speed >= WORTH_IT else "float32"
+    return Computed(name, f"bfloat16 is {speed:.1f} times as fast as float32 here, worth it from {WORTH_IT}")
+
+
+def autocast(device: str, dtype: torch.dtype) -> AbstractContextManager[None]:
+    """Networks inside compute in this precision; parameters and sums stay in float32."""
+    return torch.autocast(torch.device(device).type, dtype, enabled=dtype != torch.float32)
