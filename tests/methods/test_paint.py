@@ -9,7 +9,7 @@ import pytest
 from ihbench.diffusion.inpaint_config import FULL
 from ihbench.diffusion.mini.weights import save_mini
 from ihbench.document.document import write
-from ihbench.methods.inpainthuman.studies.paint_table import summary, table
+from ihbench.methods.inpainthuman.studies.paint_table import SEEN, TRUTH, summary, table
 from tests.diffusion.tiny_diffusion import tiny_backbone
 
 
@@ -30,8 +30,10 @@ def test_every_row_is_scored_in_every_scene(painted):
     told, out = painted
     assert set(told["scenes"]) == {"standin-1", "standin-2"}
     for rows in told["scenes"].values():
-        assert list(rows) == ["mean", "temporal", "generic+sg", FULL]
-        assert all(4 < scores["psnr"] < 60 for scores in rows.values())
+        assert list(rows) == ["mean", "temporal", "generic+sg", FULL, TRUTH, SEEN]
+        assert all(4 < rows[name]["psnr"] < 60 for name in list(rows)[:4])
+        bounds = [rows[name].keys() for name in (TRUTH, SEEN)]
+        assert bounds == 2 * [{"delta_e", "flicker"}]
         # most of the hidden surface is shown by another frame
         assert rows["temporal"]["psnr_on_body"] > rows["mean"]["psnr_on_body"] + 1
         assert rows["generic+sg"]["psnr"] != rows[FULL]["psnr"]
@@ -47,7 +49,7 @@ def test_the_table_has_intervals_and_the_full_methods_lead(painted):
     assert result["mean"]["lead"]["mean"] == pytest.approx(2)
     assert "lead" not in result[FULL]
     assert "| mean | 10.50 (" in write(table(result, "two scenes"), "md")
-    assert painted[1].joinpath("paint.md").read_text().count("\n| ") == 5
+    assert painted[1].joinpath("paint.md").read_text().count("\n| ") == 7
 
 
 @pytest.mark.parametrize(

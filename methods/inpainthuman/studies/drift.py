@@ -14,7 +14,7 @@ from ihbench.body import Body
 from ihbench.body.uv import texel_table
 from ihbench.diffusion.crops.crop_view import CropView
 from ihbench.methods.inpainthuman.inpainting.surface_colours import counted_colours, off_the_rim
-from ihbench.methods.inpainthuman.studies.patch_texture import lab, patch_count, patch_texture
+from ihbench.methods.inpainthuman.studies.patch_texture import patch_count, patch_texture
 from ihbench.metrics.flip import flip
 from ihbench.metrics.psnr import decibels, psnr
 from ihbench.metrics.ssim import ssim
@@ -36,7 +36,7 @@ class Drift:
 
     texels: int  # painted in some view and seen in another
     rgb: float  # mean |ΔRGB|, of 1
-    delta_e: float  # CIE76
+    delta_e: float  # CIEDE2000
     rgb_floor: float
     delta_e_floor: float
     patches: int  # painted in some view and seen in another
@@ -150,7 +150,9 @@ def _euclidean(a: NDArray, b: NDArray) -> NDArray:
 
 
 def _delta_e(a: NDArray, b: NDArray) -> NDArray:
-    return _euclidean(lab(a), lab(b))
+    from skimage.color import deltaE_ciede2000, rgb2lab
+
+    return np.asarray(deltaE_ciede2000(rgb2lab(a), rgb2lab(b)))
 
 
 def _from_seen(

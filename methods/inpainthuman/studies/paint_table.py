@@ -23,6 +23,7 @@ from ihbench.scene.protocol import Protocol
 from ihbench.scene.views import open_scene, uncovered
 
 T = TypeVar("T")
+TRUTH, SEEN = "the true images", "surface that is seen"  # rows that bound drift and flicker
 SIZES = {"mini": (128, False), "sd2": (512, True)}  # px, height of all painters' crops, and whether they are square
 
 
@@ -37,7 +38,8 @@ def paint_scene(
     progress: Progress,
     device: str = "cpu",
 ) -> tuple[dict[str, dict[str, float]], NDArray[np.uint8]]:
-    """Row -> scores over the scene's hidden pixels, and a picture. Raises `BadInput` when nothing is hidden."""
+    """Row -> scores over the scene's hidden pixels, and a picture. Two more rows bound drift and flicker: the true
+    images as a painting, and surface that is seen. Raises `BadInput` when nothing is hidden."""
     from ihbench.methods.inpainthuman.studies.drift import flicker, hidden_scores, identity_drift
 
     def paint(row: str, seed: int, ledger: Ledger) -> list[NDArray[np.uint8]]:
@@ -89,6 +91,9 @@ def paint_scene(
             pictures.setdefault(row, _row(painted))
         means[row] = {name: float(np.mean([s[name] for s in scored])) for name in scored[0]}
         progress.say(f"{capture.name} {row}: {means[row]['psnr']:.2f} dB, {means[row]['seconds']:.0f} s")
+    drift, flick = identity_drift(asked, truth_images, body), flicker(asked, truth_images, body)
+    means[TRUTH] = {"delta_e": drift.delta_e, "flicker": flick.deviation}
+    means[SEEN] = {"delta_e": drift.delta_e_floor, "flicker": flick.deviation_floor}
     masked = [np.where(view.unknown[..., None], np.uint8(128), view.image) for view in asked]
     return means, np.concatenate([_row(truth_images), _row(masked), *pictures.values()], 0)
 
@@ -117,7 +122,7 @@ def summary(scenes: Mapping[str, Mapping[str, Mapping[str, float]]]) -> dict[str
             if finite:
                 interval = mean_interval(finite)
                 out[row][score] = _numbers(interval) | {"n": interval.n}
-        if FULL in rows and row != FULL and len(scenes) > 1:
+        if FULL in rows and row not in (FULL, TRUTH, SEEN) and len(scenes) > 1:
             full = {scene: scores[FULL]["psnr"] for scene, scores in scenes.items()}
             own = {scene: scores[row]["psnr"] for scene, scores in scenes.items()}
             lead = paired_test(full, own)

@@ -7,20 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.body.uv import Texels
-from ihbench.metrics.flip import TO_XYZ, linear
 
 PATCH = 1 / 16  # of the texture's side, about 10 cm of an SMPL body: a patch's side
 STEP = 1 / 64  # of the texture's side, over which lightness is compared
 COVERED = 0.5  # share of a patch that a view must show
 DIRECTIONS = ((0, 1), (1, 1), (1, 0), (1, -1))  # row, column: 0°, 45°, 90°, 135° of the texture
 STATISTICS = 3 + len(DIRECTIONS)
-
-
-def lab(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
-    """[..., 3] sRGB in [0, 1] -> CIE L*a*b* (1976, D65): L in [0, 100]."""
-    t = linear(np.asarray(rgb, np.float64)) @ TO_XYZ.T
-    f = np.where(t > (6 / 29) ** 3, np.cbrt(t), t / (3 * (6 / 29) ** 2) + 4 / 29)
-    return np.stack([116 * f[..., 1] - 16, 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])], -1)
 
 
 def patch_count(resolution: int) -> int:
@@ -40,6 +32,8 @@ def patch_texture(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Patches [p], squares of the texture of which `COVERED` is given, ascending, and what they look like [p, 7] in
     units of L*a*b*: the standard deviations of L, a and b, and the mean |ΔL| over `STEP` in four directions."""
+    from skimage.color import rgb2lab
+
     size, side = texels.resolution, patch_side(texels.resolution)
     across = _patches_across(size)
     row, column = np.divmod(np.arange(size * size), size)
@@ -47,7 +41,7 @@ def patch_texture(
     chart = np.bincount(patch[texels.index], minlength=across**2)
     index = texels.index[texel]
     given = np.bincount(patch[index], minlength=across**2)
-    values = lab(rgb)
+    values = rgb2lab(rgb)
     out = np.full((across**2, STATISTICS), np.nan)
     for k in range(3):
         mean = _patch_means(patch[index], values[:, k], across**2)
