@@ -144,7 +144,7 @@ class Personaliser:
             {"params": [named[n] for n in named if rates[n] == rate], "lr": rate, "base": rate, "weight_decay": 0.0}
             for rate in sorted(set(rates.values()))
         ]
-        optimizer = torch.optim.AdamW(groups)
+        optimizer = torch.optim.AdamW(groups, fused=True)
         for p in named.values():
             p.data = p.data.float()  # steps of 1e-5 are lost in half precision
         curve = self.curves.setdefault(state, Curve([], []))
@@ -162,12 +162,11 @@ class Personaliser:
                     value = float("nan") if loss is None else loss.item()
                     if loss is not None and loss.requires_grad:
                         loss.backward()
-                    norm = _gradient_norm(named)
+                    norm = float(torch.nn.utils.clip_grad_norm_(list(named.values()), 1.0))
                     fine = loss is None or (math.isfinite(value) and math.isfinite(norm))
                     if loss is not None and fine:
                         if step % GOOD_EVERY == 0:
                             good = (step, _copies(named))  # a finite loss vouches for them
-                        torch.nn.utils.clip_grad_norm_(list(named.values()), 1.0)
                         optimizer.step()
                 except (MemoryError, RuntimeError) as error:
                     line = f"{what}: one crop does not fit into memory; {ADVICE[self.backbone.name]}"
@@ -307,8 +306,3 @@ def _copies(named: dict[str, nn.Parameter]) -> dict[str, Tensor]:
 
 def _finite(named: dict[str, nn.Parameter]) -> bool:
     return all(bool(torch.isfinite(p).all()) for p in named.values())
-
-
-def _gradient_norm(named: dict[str, nn.Parameter]) -> float:
-    norms = [p.grad.norm() for p in named.values() if p.grad is not None]
-    return float(torch.stack(norms).norm()) if norms else 0.0
