@@ -198,6 +198,8 @@ class SafeUnpickler(pickle._Unpickler):  # in Python: it allocates nothing that 
     def __init__(self, data: bytes):
         super().__init__(io.BytesIO(data), encoding="latin1")  # maps the bytes of python-2 strings one to one
         self._bytes = 2**20 + GROWTH * len(data)
+        self._most = self._bytes  # values, however often they are shared
+        self._values: dict[int, int] = {}  # in the result of a shared container, by its id
         self._depth: dict[int, int] = {}  # by id of a tuple; one that takes a freed one's id takes its place here
         self._foreign: dict[tuple[str, str], type] = {}
         # id -> (original, result), so that a value shared in many places is visited once; the original is there to
@@ -233,10 +235,19 @@ class SafeUnpickler(pickle._Unpickler):  # in Python: it allocates nothing that 
             open_ended = isinstance(value, list | dict | ForeignObject)  # these may hold themselves
             self._done[id(value)] = value, value if open_ended else _UNFINISHED
             self._done[id(value)] = value, self._resolved(value)
+            self._count(value)
         result = self._done[id(value)][1]
         if result is _UNFINISHED:
             raise pickle.UnpicklingError("refused an array or a tuple that holds itself")
         return result
+
+    def _count(self, value: Any) -> None:
+        """Refuse a value that shares its parts so often that walking it would never end."""
+        data = value.state[-1] if isinstance(value, _ArrayRecord) else value
+        parts = data.values() if isinstance(data, dict) else data if isinstance(data, list | tuple) else ()
+        self._values[id(value)] = count = 1 + sum(self._values.get(id(part), 1) for part in parts)
+        if count > self._most:
+            raise pickle.UnpicklingError("refused: a small file that grows too large")
 
     def _resolved(self, value: Any) -> Any:
         if isinstance(value, tuple):
