@@ -260,10 +260,10 @@ def paths_are_numbers(content):
 @pytest.mark.parametrize(
     ("damage", "expected"),
     [
-        (with_cams(K=[np.eye(4)] * 2), r"cams\['K'\] to be one array of shape \[3, 3\].*found a list of other"),
-        (with_cams(D=[np.zeros((4, 1))] * 2), r"cams\['D'\].*shape \[5\].*found a list"),
-        (with_cams(R=[np.zeros((3, 1))] * 2), r"cams\['R'\].*found a list"),
-        (with_cams(T=[np.zeros((2, 1))] * 2), r"cams\['T'\].*found a list"),
+        (with_cams(K=[np.eye(4)] * 2), r"cams\['K'\] to be one array of shape \[3, 3\].*found \[4, 4\]"),
+        (with_cams(D=[np.zeros((4, 1))] * 2), r"cams\['D'\].*shape \[5\].*found \[4\]"),
+        (with_cams(R=[np.zeros((3, 1))] * 2), r"cams\['R'\].*found \[3, 1\]"),
+        (with_cams(T=[np.zeros((2, 1))] * 2), r"cams\['T'\].*found \[2\]"),
         (with_cams(T=[np.zeros((3, 1)), np.zeros((2, 1))]), r"cams\['T'\].*found a list of other contents"),
         (with_cams(K=[np.full((3, 3), np.nan)] * 2), r"cams\['K'\].*NaN"),
         (with_cams(K=[np.eye(3)]), "found 1 K, 2 D, 2 R, 2 T"),
