@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cache
 from typing import ClassVar
@@ -55,6 +54,6 @@ def choose(wanted: Precision, device: str) -> Computed:
     return Computed(name, f"bfloat16 is {speed:.1f} times as fast as float32 here, worth it from {WORTH_IT}")
 
 
-def autocast(device: str, dtype: torch.dtype) -> AbstractContextManager[None]:
+def autocast(device: str, dtype: torch.dtype) -> torch.autocast:
     """Networks inside compute in this precision; parameters and sums stay in float32."""
     return torch.autocast(torch.device(device).type, dtype, enabled=dtype != torch.float32)

@@ -71,11 +71,11 @@ def neighbour_pairs(
 ) -> NDArray[np.int64]:
     """[E, 2] first < second, ascending: each point with its nearest neighbours whose normals do not oppose its own,
     and with its nearest of all whichever way that looks. In space, not in UV: so links cross the seams of a chart."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     if len(points) < 2:
         return np.empty((0, 2), np.int64)
-    _, near = cKDTree(points).query(points, min(NEIGHBOURS + 1, len(points)))
+    near = np.asarray(KDTree(points).query(points, min(NEIGHBOURS + 1, len(points)))[1], np.int64)
     first = np.repeat(np.arange(len(points)), near.shape[1] - 1)
     # coincident points may stand before a point itself among its neighbours
     second = np.where(near[:, :1] == np.arange(len(points))[:, None], near[:, 1:], near[:, :-1]).ravel()
