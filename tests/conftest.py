@@ -35,6 +35,7 @@ test = { cameras = { step = 8 }, frames = { step = 480 } }
 """
 # the second level is finer than 64 px can show; it is set here, so the plan leaves it
 TINY_SWITCHES = [
+    *("--method.precision", "float32"),  # else as the machine has it
     *("--method.texels", "32", "--method.levels", "16", "256", "--method.decoder-width", "32"),
     *("--method.position-map", "16", "--method.steps", "8", "--method.inpaint.no-on"),
 ]

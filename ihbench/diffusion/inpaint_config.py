@@ -96,7 +96,7 @@ class InpaintConfig:
     context: Literal["seen", "frame"] = "seen"
     """What the inpainter is shown besides visible pixels. "seen": hidden pixels whose surface another frame shows are
     drawn by the stage-1 avatar, and only what no frame shows is painted. "frame": the frame alone, as the paper."""
-    trust: Annotated[float, Within(0, 1)] = 0.8
+    trust: Annotated[float, Within(0, 1)] = 0.4
     """Weight of the painter's colours; the rest is the stage-1 avatar's own guess, which errs differently. 1: the
     painter alone (the paper). With context "seen" only."""
     facing: Annotated[float, Within(0, 0.999)] = 0.0

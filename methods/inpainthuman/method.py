@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from ihbench.body import Body
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
+from ihbench.fit.precision import DTYPES, Computed, choose
 from ihbench.methods.inpainthuman.avatar.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.config import InpaintHumanConfig
 from ihbench.methods.inpainthuman.stages.stage1 import Stage1
@@ -40,6 +42,7 @@ class InpaintHuman:
                 check_sam(inpaint.sam_weights)
             betas = np.mean([view.body_pose.betas for view in training.views], axis=0)
             avatar = GaussianAvatar(self.config, training.body, betas, seed).to(device)
+            avatar.fit_dtype = self._precision(device, ledger)
         with ledger.stage("fit/stage1"):
             Stage1(avatar, training, seed, ledger).run(progress)
         if self.config.paints:
@@ -52,6 +55,15 @@ class InpaintHuman:
             with ledger.stage("fit/stage3"):
                 Stage3(avatar, training, painted, seed, ledger).run(progress)
         return avatar
+
+    def _precision(self, device: str, ledger: Ledger) -> torch.dtype:
+        """As the record says that the run began, else chosen now and put there."""
+        said = [event.data["precision"] for event in ledger.events if event.kind == Computed.kind]
+        if not said:
+            computed = choose(self.config.precision, device)
+            ledger.event(computed)
+            said = [computed.precision]
+        return DTYPES[said[-1]]
 
     def load(self, folder: Path, body: Body, device: str = "cpu") -> GaussianAvatar:
         """Read an avatar written by `GaussianAvatar.save`."""

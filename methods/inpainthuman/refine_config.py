@@ -12,7 +12,7 @@ WEIGHT = Within(0, 1e6)  # of a term of the loss
 
 @dataclass(frozen=True)
 class RefineConfig:
-    steps: Annotated[int, Within(0, STEPS)] = 300
+    steps: Annotated[int, Within(0, STEPS)] = 200
     """Steps of stage 3, one view each; 0 leaves it out."""
     weight: Annotated[float, WEIGHT] = 1.0
     """Weight of the whole refinement loss beside stage 1's, which is kept (λ_refine, sec. 3.4)."""

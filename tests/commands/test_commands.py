@@ -48,8 +48,8 @@ def test_plan_says_what_a_run_would_measure_and_leave_out(bench_with_run, finish
     assert "5 training views (4 occluded), 4 test views" in plain.out
     assert re.search(r"^  occlusion strip-generic \(mid \d+, width \d+\): hides ", plain.out, re.M)
     left_out = told["scenes"]["standin-1"]["left_out"]
-    assert [omission["field"] for omission in left_out] == ["levels", "texels", "inpaint.facing"]
-    levels, texels, _ = left_out
+    assert [omission["field"] for omission in left_out] == ["levels", "texels", "inpaint.ti", "inpaint.facing"]
+    levels, texels, *_ = left_out
     assert f"left out: levels -> ({levels['value'][0]},): {levels['reason']}" in plain.out
     assert f"left out: texels -> {texels['value']}: {texels['reason']} (saves about" in plain.out
     assert "--keep FIELD" in plain.out

@@ -14,7 +14,7 @@ from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput
-from ihbench.methods.inpainthuman.avatar.avatar import GaussianAvatar
+from ihbench.methods.inpainthuman.avatar.avatar import DECODED_KEPT, GaussianAvatar
 from ihbench.methods.inpainthuman.avatar.decoder import GaussianDecoder, positional_encoding, scale_factor
 from ihbench.methods.inpainthuman.config import QUICK
 from ihbench.methods.inpainthuman.method import InpaintHuman
@@ -37,7 +37,7 @@ def single_thread():
 def posed(avatar, body_pose, offset=None):
     """[N, 3] world points of an avatar with this canonical offset [N, 3]."""
     offset = torch.zeros(len(avatar), 3) if offset is None else offset
-    return avatar.pose_points(avatar.every_point, offset, avatar.transforms(body_pose)).detach().numpy()
+    return avatar.posed(avatar.every_point, avatar.transforms(body_pose)).moved(offset).detach().numpy()
 
 
 def on_the_surface(avatar, body_pose):
@@ -183,7 +183,7 @@ def test_a_decoder_starts_on_the_surface_in_grey(layers):
     decoder = GaussianDecoder(20, 16, layers, torch.Generator().manual_seed(0))
     assert [(m.in_features, m.out_features) for m in decoder.linear][-1][1] == 7
     assert len(decoder.linear) == layers
-    offset, scale, color = decoder(torch.randn(50, 20))
+    offset, scale, color = decoder(torch.randn(50, 8), torch.randn(50, 12))
     assert not offset.any()
     assert not scale.any()
     assert (color == 0.5).all()
@@ -325,7 +325,7 @@ def test_culling_hardly_changes_the_picture(texels, size, azimuth):
     camera, pose = a_camera(azimuth, size), a_pose(0.2, 0.7)
     kept = avatar.unhidden(camera, pose)
     assert 0.2 * len(avatar) < len(kept) < 0.9 * len(avatar)
-    few = render_gaussians(*avatar.gaussians(pose, torch.from_numpy(kept)), camera, WHITE)
+    few = render_gaussians(*(part[torch.from_numpy(kept)] for part in avatar.gaussians(pose)), camera, WHITE)
     avatar.config = replace(avatar.config, cull=False)
     assert len(avatar.unhidden(camera, pose)) == len(avatar)
     for a, b in zip((part.numpy() for part in few), avatar.render(camera, pose), strict=True):
@@ -477,3 +477,29 @@ def test_a_place_that_cannot_be_written_is_said_and_nothing_is_left_there(tmp_pa
     with pytest.raises(BadInput, match=r"avatar\.safetensors"):
         an_avatar().save(tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["avatar.safetensors", "file"]
+
+
+def nudge(avatar):
+    avatar.decoder.linear[-1].bias.grad = -torch.ones(7)
+
+
+def test_what_is_decoded_is_kept_for_other_cameras_and_no_longer_than_the_parameters(monkeypatch):
+    avatar = shaken(an_avatar(), 0.1)
+    avatar.residual_on = True
+    decoded = []
+    decode = avatar.decode
+    monkeypatch.setattr(avatar, "decode", lambda *given: decoded.append(1) or decode(*given))
+    poses = [a_pose(0.2 * k, 0.1 * k) for k in range(DECODED_KEPT)]
+    first = [avatar.render(a_camera(yaw), pose)[0] for pose in poses for yaw in (0.0, 1.0)]
+    assert len(decoded) == len(poses)
+    torch.optim.AdamW([avatar.decoder.linear[-1].bias], lr=0.5, fused=True).step(lambda: nudge(avatar))
+    again = avatar.render(a_camera(0.0), poses[0])[0]
+    assert len(decoded) == len(poses) + 1
+    assert not np.allclose(again, first[0])
+    fresh = shaken(an_avatar(), 0.1)
+    fresh.residual_on = True
+    np.testing.assert_array_equal(fresh.render(a_camera(1.0), poses[3])[0], first[7])
+    avatar.render(a_camera(0.0), a_pose(1.0, 0.1 * 1))  # the root alone is another
+    assert len(decoded) == len(poses) + 2
+    avatar.render(a_camera(0.0), a_pose(2.0, 0.1 * 1))
+    assert len(decoded) == len(poses) + 2

@@ -54,7 +54,7 @@ def test_the_paper_profile_has_the_papers_numbers():
     assert (PAPER.lr_maps, PAPER.lr_decoder, PAPER.lr_encoder, PAPER.lr_final) == (1e-4, 1e-4, 1e-4, 1)
     assert (PAPER.texels, PAPER.steps, PAPER.position_map, PAPER.residual_channels) == (512, 3000, 128, 32)
     assert PAPER.residual_start == 0.3
-    assert (QUICK.texels, QUICK.steps) == (256, 600)
+    assert (QUICK.texels, QUICK.steps) == (256, 400)
     assert not PAPER.paper_strict
 
 

@@ -23,6 +23,7 @@ from ihbench.scoring.calibration import ROWS, Calibration
 from tests.conftest import contents
 
 SWITCHES = {
+    "precision": "float32",
     "texels": 32,
     "levels": (16, 256),
     "decoder_width": 32,

@@ -204,6 +204,23 @@ def test_a_far_camera_makes_the_pixels_coarse():
     assert [o.value for o in leave_out(QUICK, far) if o.field == "levels"] == [(64,)]
 
 
+def test_a_word_is_learned_only_for_a_model_to_which_it_is_worth_something(moving):
+    def word(scene=moving, **changes):
+        config = replace(QUICK, inpaint=replace(QUICK.inpaint, **changes))
+        return [o.value for o in leave_out(config, scene) if o.field == "inpaint.ti"]
+
+    assert word() == word(turntable=4) == word(context="frame") == [False]
+    for own in (
+        {"backbone": "sd2", "weights": "x"},
+        {"weights": "x"},
+        {"ti": False},
+        {"on": False},
+        {"filler": "mean"},
+    ):
+        assert word(**own) == []
+    assert word(replace(moving, hidden_texels=0.001)) == [], "nothing is painted, so no word is left out"
+
+
 def test_nothing_is_painted_where_every_frame_shows_all(moving, monkeypatch):
     seen = replace(moving, hidden_texels=0.001)
     (omission,) = [o for o in leave_out(QUICK, seen) if o.field == "one_fit"]

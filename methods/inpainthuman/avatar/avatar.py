@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.nn.functional import embedding_bag
 
 from ihbench.body import Body
 from ihbench.body.canonical import canonical_pose
@@ -19,17 +18,32 @@ from ihbench.body.uv import chart_padding, texel_table
 from ihbench.camera import Camera
 from ihbench.config_fields import read
 from ihbench.errors import BadInput
+from ihbench.fit.precision import autocast
 from ihbench.methods.inpainthuman.avatar.decoder import GaussianDecoder, positional_encoding, scale_factor
 from ihbench.methods.inpainthuman.avatar.pose_residual import ResidualEncoder, root_free_position_map
 from ihbench.methods.inpainthuman.avatar.uv_features import UVFeatures, bilinear_corners
 from ihbench.methods.inpainthuman.config import InpaintHumanConfig
+from ihbench.nets.weighted_rows import weighted_rows
 from ihbench.render.splat import render_gaussians
 from ihbench.render.triangles import triangle_areas, triangle_crosses
 from ihbench.render.zbuffer import rasterize
 
+DECODED_KEPT = 16  # poses, 1.5 MB each in the quick profile
 CULL_SLACK = 0.04  # m behind the nearest body surface; garments and offsets stay well within it
 CULL_BACK_SLACK = 0.012  # m, for points whose normal is turned well away: the far side of an arm, not of a finger
 CULL_FACING = -0.3  # cosine below which a normal is turned well away, beyond the silhouette's rim
+
+
+@dataclass(frozen=True)
+class PosedPoints:
+    """Points of the body in one pose."""
+
+    surface: Tensor  # [n, 3] m, world, without an offset
+    turn: Tensor  # [n, 3, 3] canonical offsets to world
+
+    def moved(self, offset: Tensor) -> Tensor:  # [n, 3] m, canonical
+        """World positions [n, 3] m."""
+        return self.surface + (self.turn @ offset[:, :, None])[:, :, 0]
 
 
 class GaussianAvatar(nn.Module):
@@ -48,11 +62,15 @@ class GaussianAvatar(nn.Module):
     residual_index: Tensor
     residual_weight: Tensor
     base_scale: Tensor
+    normals: Tensor  # [N, 3] in the canonical pose, of any length
 
     def __init__(self, config: InpaintHumanConfig, body: Body, betas: NDArray[np.float64], seed: int):
         super().__init__()
         self.config, self.body, self.betas = config, body, np.asarray(betas, np.float64)
         self.residual_on = False
+        self.fit_dtype = torch.float32  # of the networks while they learn
+        self._kept: dict[bytes, tuple[Tensor, Tensor, Tensor]] = {}  # decoded, by pose
+        self._decoded_from: list[tuple[int, float]] = []  # these parameters: versions and sums
         generator = torch.Generator().manual_seed(seed)
         texels = texel_table(body, config.texels)
         self.texels = texels
@@ -69,10 +87,12 @@ class GaussianAvatar(nn.Module):
         per_face = np.bincount(texels.face, minlength=len(body.faces))
         spacing = np.sqrt(_smoothed_area(texels.face, face_area, per_face, body.faces))
 
+        normals = triangle_crosses(vertices[body.faces[texels.face]])
         for name, value in (
             ("weights", weights),
             ("rest", rest),
             ("to_rest", np.linalg.inv(blended[:, :, :3])),
+            ("normals", np.einsum("nab,nb->na", blended[:, :, :3], normals)),
             ("base_scale", np.minimum(config.scale_initial * spacing, config.scale_limit)),
         ):
             self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(value, np.float32)), persistent=False)
@@ -96,12 +116,17 @@ class GaussianAvatar(nn.Module):
                 torch.manual_seed(seed)
                 self.encoder = ResidualEncoder(config.residual_channels, width)
             index, weight = self._corners(config.position_map)
-            self.register_buffer("residual_index", torch.from_numpy(index), persistent=False)
+            self.register_buffer("residual_index", torch.from_numpy(index.astype(np.int32)), persistent=False)
             self.register_buffer("residual_weight", torch.from_numpy(weight), persistent=False)
 
     def _corners(self, resolution: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         inside = texel_table(self.body, resolution).mask
         return bilinear_corners(self.texels.uv, chart_padding(inside, resolution))
+
+    @property
+    def canonical_points(self) -> Tensor:
+        """[N, 3] m"""
+        return self.encoded[:, :3]
 
     @property
     def device(self) -> torch.device:
@@ -121,27 +146,30 @@ class GaussianAvatar(nn.Module):
         positions = root_free_position_map(self.body, body_pose, self.config.position_map)
         return torch.from_numpy(positions).to(self.device)
 
-    def decode(self, points: Tensor, position_map: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Offset [n, 3] m (canonical axes), scale [n] m and colour [n, 3] of some points (eq. 1)."""
-        feature = self.features(points)
-        if self.residual_on and position_map is not None:
-            feature = feature + embedding_bag(
-                self.residual_index[points],
-                self.encoder(position_map).to(self.residual_weight.dtype),  # half precision under autocast
-                per_sample_weights=self.residual_weight[points],
-                mode="sum",
-            )
-        raw_offset, raw_scale, color = self.decoder(torch.cat([feature, self.encoded[points]], 1))
+    def decode(
+        self, points: Tensor, position_map: Tensor | None, decay: float = 0.0
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Offset [n, 3] m (canonical axes), scale [n] m and colour [n, 3] of some points (eq. 1). `decay`: see
+        `UVFeatures`."""
+        with autocast(self.device.type, self.fit_dtype if torch.is_grad_enabled() else torch.float32):
+            feature = self.features(points, decay)
+            if self.residual_on and position_map is not None:
+                # contiguous: the encoder hands out a transposed map, whose rows are slow to read
+                residual = self.encoder(position_map).to(self.residual_weight.dtype).contiguous()
+                feature = feature + weighted_rows(residual, self.residual_index, self.residual_weight, points)
+            raw_offset, raw_scale, color = self.decoder(feature, self.encoded[points])
         config = self.config
+        raw_offset, raw_scale, color = (out.to(self.base_scale.dtype) for out in (raw_offset, raw_scale, color))
         offset = config.offset_scale * (torch.tanh(raw_offset) if config.offset == "tanh" else raw_offset)
         scale = self.base_scale[points] * scale_factor(raw_scale, config.scale_activation)
         return offset, scale.clamp(max=config.scale_limit), color
 
-    def pose_points(self, points: Tensor, offset: Tensor, transforms: Tensor) -> Tensor:  # transforms [24, 3, 4]
-        """World positions [n, 3] m of canonical points with offsets, by linear blend skinning (eq. 2)."""
-        rest = self.rest[points] + (self.to_rest[points] @ offset[:, :, None])[:, :, 0]
+    def posed(self, points: Tensor, transforms: Tensor) -> PosedPoints:  # transforms [24, 3, 4]
+        """Where points stand in a pose, and how their offsets turn with it, by linear blend skinning (eq. 2)."""
         blended = (self.weights[points] @ transforms.reshape(24, 12)).reshape(-1, 3, 4)
-        return (blended[:, :, :3] @ rest[:, :, None])[:, :, 0] + blended[:, :, 3]
+        turn = blended[:, :, :3] @ self.to_rest[points]
+        surface = (blended[:, :, :3] @ self.rest[points][:, :, None])[:, :, 0] + blended[:, :, 3]
+        return PosedPoints(surface, turn)
 
     def transforms(self, body_pose: BodyPose) -> Tensor:
         """[24, 3, 4] rest pose to this pose, with the avatar's own shape."""
@@ -174,12 +202,25 @@ class GaussianAvatar(nn.Module):
         return np.flatnonzero((p[:, 2] > 0) & (p[:, 2] <= depth[row, column] + slack))
 
     @torch.no_grad()
-    def gaussians(self, body_pose: BodyPose, points: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+    def gaussians(self, body_pose: BodyPose) -> tuple[Tensor, Tensor, Tensor]:
         """World means [n, 3] m, scales [n] m and colours [n, 3] in a pose."""
-        points = self.every_point if points is None else points
-        position_map = self.position_map(body_pose) if self.residual_on else None
-        offset, scale, color = self.decode(points, position_map)
-        return self.pose_points(points, offset, self.transforms(body_pose)), scale, color
+        offset, scale, color = self._decoded(body_pose)
+        return self.posed(self.every_point, self.transforms(body_pose)).moved(offset), scale, color
+
+    def _decoded(self, body_pose: BodyPose) -> tuple[Tensor, Tensor, Tensor]:
+        """`decode` of every point, kept for the next camera: it depends on the pose of the joints at most."""
+        # fused optimisers change parameters without counting a version, so their sums are looked at, too
+        state = [(p._version, float(p.detach().sum())) for p in self.parameters()]
+        if state != self._decoded_from:
+            self._kept.clear()
+            self._decoded_from = state
+        key = body_pose.pose[1:].tobytes() + body_pose.betas.tobytes() if self.residual_on else b""
+        if key not in self._kept:
+            if len(self._kept) >= DECODED_KEPT:
+                self._kept.pop(next(iter(self._kept)))
+            position_map = self.position_map(body_pose) if self.residual_on else None
+            self._kept[key] = self.decode(self.every_point, position_map)
+        return self._kept[key]
 
     def render(
         self,

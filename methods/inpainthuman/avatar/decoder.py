@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
+from typing import cast
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import softplus
+from torch.nn.functional import linear, softplus
 
 SOFTPLUS_ONE = math.log(math.e - 1)  # softplus of this is 1
 
@@ -25,19 +26,23 @@ class GaussianDecoder(nn.Module):
 
     def __init__(self, in_features: int, width: int, layers: int, generator: torch.Generator):
         super().__init__()
-        linear = [nn.Linear(a, b) for a, b in pairwise([in_features, *[width] * (layers - 1), 7])]
-        for layer in linear:
+        stack = [nn.Linear(a, b) for a, b in pairwise([in_features, *[width] * (layers - 1), 7])]
+        for layer in stack:
             bound = 1 / math.sqrt(layer.in_features)
             nn.init.uniform_(layer.weight, -bound * math.sqrt(3), bound * math.sqrt(3), generator=generator)
             nn.init.zeros_(layer.bias)
-        nn.init.zeros_(linear[-1].weight)
-        self.linear = nn.ModuleList(linear)
+        nn.init.zeros_(stack[-1].weight)
+        self.linear = nn.ModuleList(stack)
 
-    def forward(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Raw outputs: offset [n, 3], scale [n], colour [n, 3] in [0, 1]."""
-        for layer in self.linear[:-1]:
-            features = torch.relu(layer(features))
-        out = self.linear[-1](features)
+    def forward(self, features: Tensor, encoded: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Raw outputs offset [n, 3], scale [n], colour [n, 3] in [0, 1] of features [n, C] and positions [n, E],
+        which are as one input [n, C + E]. Apart, what needs no gradient has none computed."""
+        first, *others = cast("list[nn.Linear]", list(self.linear))
+        of_features, of_encoded = first.weight.split([features.shape[1], encoded.shape[1]], 1)
+        hidden = linear(features, of_features, first.bias) + linear(encoded, of_encoded)
+        for layer in others:
+            hidden = layer(torch.relu_(hidden))
+        out = hidden
         return out[:, :3], out[:, 3], torch.sigmoid(out[:, 4:])
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.nn.functional import embedding_bag
 
 from ihbench.body.uv import map_coordinates
+from ihbench.nets.weighted_rows import weighted_rows
 
 
 def bilinear_corners(
@@ -33,7 +33,8 @@ def bilinear_corners(
 class UVFeatures(nn.Module):
     """The learnable maps and where each canonical point samples them.
 
-    All levels share one table [sum of R², C]; the sum over levels is then a single weighted gather of 4·L rows.
+    All levels share one table [sum of R², C]; the sum over levels is then a single weighted sum of rows. `decay` is
+    the weight of half the squared table in the loss.
     """
 
     index: Tensor
@@ -50,24 +51,31 @@ class UVFeatures(nn.Module):
     ):
         super().__init__()
         start = np.cumsum([0] + [r * r for r in resolutions])
-        self.levels = len(resolutions)
         self.fusion = fusion
-        self.out_channels = channels * (self.levels if fusion == "concat" else 1)
+        self.out_channels = channels * (len(resolutions) if fusion == "concat" else 1)
         self.table = nn.Parameter(torch.randn(int(start[-1]), channels, generator=generator) * std)
-        index = [torch.from_numpy(i + s) for (i, _), s in zip(corners, start[:-1], strict=True)]
-        self.register_buffer("index", torch.cat(index, 1), persistent=False)  # [N, 4 L]
-        self.register_buffer("weight", torch.from_numpy(np.concatenate([w for _, w in corners], 1)), persistent=False)
+        corners = [nearest_only(index + s, weight) for (index, weight), s in zip(corners, start[:-1], strict=True)]
+        self.rows = [index.shape[1] for index, _ in corners]  # of each level
+        index, weight = (np.concatenate(parts, 1) for parts in zip(*corners, strict=True))
+        self.register_buffer("index", torch.from_numpy(index.astype(np.int32)), persistent=False)  # [N, rows]
+        self.register_buffer("weight", torch.from_numpy(weight), persistent=False)
 
-    def forward(self, points: Tensor) -> Tensor:  # [n] point numbers
+    def forward(self, points: Tensor, decay: float = 0.0) -> Tensor:  # [n] point numbers
         """Features [n, C] (sum) or [n, L C] (concat) of the chosen points."""
-        index, weight = self.index[points], self.weight[points]
         if self.fusion == "sum":
-            return embedding_bag(index, self.table, per_sample_weights=weight, mode="sum")
-        n = len(points)
-        per_level = embedding_bag(
-            index.reshape(n * self.levels, 4),
-            self.table,
-            per_sample_weights=weight.reshape(n * self.levels, 4),
-            mode="sum",
-        )
-        return per_level.reshape(n, -1)
+            return weighted_rows(self.table, self.index, self.weight, points, decay)
+        decays = [decay] + [0.0] * (len(self.rows) - 1)
+        parts = zip(self.index.split(self.rows, 1), self.weight.split(self.rows, 1), decays, strict=True)
+        return torch.cat([weighted_rows(self.table, *part[:2], points, part[2]) for part in parts], 1)
+
+
+def nearest_only(
+    index: NDArray[np.int64],  # [N, 4]
+    weight: NDArray[np.float32],  # [N, 4]
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """One row a point, where all points stand on texels of the level; else the four as they are."""
+    best = weight.argmax(1)[:, None]
+    alone = np.take_along_axis(weight, best, 1)
+    if not (alone > 1 - 1e-5).all():
+        return index, weight
+    return np.take_along_axis(index, best, 1), np.ones_like(alone)

@@ -6,17 +6,21 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from ihbench.body.uv import nearest_texels
 from ihbench.camera import Camera
 from ihbench.clock.ledger import Ledger
 from ihbench.fit.losses import dissimilarity, masked_mean, where_known
 from ihbench.fit.optimisation import Optimisation, ParameterGroup
-from ihbench.methods.inpainthuman.avatar.avatar import GaussianAvatar
-from ihbench.methods.inpainthuman.config import ONE_FIT_SSIM
+from ihbench.fit.surface_prior import SurfacePrior
+from ihbench.methods.inpainthuman.avatar.avatar import GaussianAvatar, PosedPoints
+from ihbench.methods.inpainthuman.config import InpaintHumanConfig
 from ihbench.methods.inpainthuman.spec import STAGE1
 from ihbench.render.splat import render_gaussians
 from ihbench.scene.contracts import MaskState, TrainingSet, TrainView
+from ihbench.scene.sightings import FINE
 from ihbench.scene.views import LazyViews
 
 MARGIN = 0.15  # of the projected body's box on every side: garments and pose errors stay inside the window
@@ -32,12 +36,16 @@ class Target:
     person: Tensor  # [h, w, 1] 1 where the visible person is
     background: Tensor  # [h, w, 1] 1 where the background is known
     points: Tensor  # [n] points that the body does not hide
-    transforms: Tensor  # [24, 3, 4]
+    posed: PosedPoints  # of these
+    links: SurfacePrior  # between these
+    evident: Tensor  # [n] 1 where some training view shows the point
     position_map: Tensor | None
 
 
-def prepare_target(avatar: GaussianAvatar, view: TrainView) -> Target:
-    """Cut a training view to the body's window and find the points it can show."""
+def prepare_target(avatar: GaussianAvatar, view: TrainView, surface: KnownSurface | None = None) -> Target:
+    """Cut a training view to the body's window and find the points it can show. Without a `surface` all of it counts
+    as seen, and nothing links one point to another."""
+    surface = KnownSurface.all_seen(avatar) if surface is None else surface
     vertices = avatar.body.pose(view.body_pose, blend_shapes=False)
     x0, y0, width, height = fitted_window(avatar, view.camera, vertices)
     camera = view.camera.cropped(x0, y0, width, height)
@@ -47,13 +55,17 @@ def prepare_target(avatar: GaussianAvatar, view: TrainView) -> Target:
     image = view.image[rows, cols].astype(np.float32) / 255
     unknown = (view.mask[rows, cols] == MaskState.UNKNOWN)[..., None]
     image = np.where(unknown & ~np.isfinite(image), 0, image)  # a NaN there would pass through a weight of 0
+    shown = avatar.unhidden(camera, view.body_pose)
+    points = torch.from_numpy(np.union1d(shown, surface.unfaced)).to(device)
     return Target(
         camera=camera,
         image=torch.from_numpy(image).to(device),
         person=(mask == MaskState.PERSON).float(),
         background=(mask == MaskState.BACKGROUND).float(),
-        points=torch.from_numpy(avatar.unhidden(camera, view.body_pose)).to(device),
-        transforms=avatar.transforms(view.body_pose),
+        points=points,
+        posed=avatar.posed(points, avatar.transforms(view.body_pose)),
+        links=surface.prior.among(points, len(avatar)),
+        evident=surface.evident[points],
         position_map=avatar.position_map(view.body_pose),
     )
 
@@ -88,13 +100,16 @@ class Drawn:
     rgb: Tensor  # [h, w, 3]
     offset: Tensor  # [n, 3] m
     scale: Tensor  # [n] m
+    color: Tensor  # [n, 3]
 
 
 def draw(avatar: GaussianAvatar, target: Target, background: tuple[float, float, float]) -> Drawn:
     """Decode, pose and splat the points of a target. Differentiable in the avatar's parameters."""
-    offset, scale, color = avatar.decode(target.points, target.position_map)
-    means = avatar.pose_points(target.points, offset, target.transforms)
-    return Drawn(render_gaussians(means, scale, color, target.camera, background)[0], offset, scale)
+    config = avatar.config
+    decay = 0.0 if config.paper_strict else 2 * config.feature_weight / avatar.features.table.numel()
+    offset, scale, color = avatar.decode(target.points, target.position_map, decay)
+    means = target.posed.moved(offset)
+    return Drawn(render_gaussians(means, scale, color, target.camera, background)[0], offset, scale, color)
 
 
 def initial_loss(avatar: GaussianAvatar, drawn: Drawn, target: Target) -> Tensor:
@@ -110,23 +125,62 @@ def initial_loss(avatar: GaussianAvatar, drawn: Drawn, target: Target) -> Tensor
     if config.paper_strict:
         return loss
     loss = loss + config.background_weight * (error * target.background).sum() / visible
-    n = max(len(drawn.offset), 1)  # a body behind the camera leaves no point
-    return (
+    n = target.evident.sum().clamp(min=1)  # a body behind the camera leaves no point
+    loss = (
         loss
-        + config.offset_weight * drawn.offset.square().sum() / (3 * n)
-        + config.scale_weight * drawn.scale.sum() / n
-        + config.feature_weight * avatar.features.table.square().mean()
+        + config.offset_weight * (drawn.offset.square().sum(1) * target.evident).sum() / (3 * n)
+        + config.scale_weight * (drawn.scale * target.evident).sum() / n
     )
+    return loss + prior_loss(avatar, drawn, target) if config.prior.on else loss
 
 
-def loss_of(avatar: GaussianAvatar, target: Target, background: tuple[float, float, float]) -> Tensor:
-    """`initial_loss` of what the avatar shows of a target; of `one_fit` with 1 - SSIM over visible person pixels."""
+def prior_loss(avatar: GaussianAvatar, drawn: Drawn, target: Target) -> Tensor:
+    """What it costs that neighbouring points differ where few views look, in colour, offset and scale."""
+    prior = avatar.config.prior
+    size = (drawn.scale / avatar.base_scale[target.points]).clamp(min=1e-6).log()[:, None]
+    columns = [prior.color**0.5 * drawn.color, prior.offset**0.5 * drawn.offset, prior.scale**0.5 * size]
+    return target.links.roughness(torch.cat(columns, 1))
+
+
+@dataclass(frozen=True)
+class KnownSurface:
+    """What the training views show of the avatar's points."""
+
+    prior: SurfacePrior
+    evident: Tensor  # [N] 1 where some view shows the point, else 0
+    unfaced: NDArray[np.int64]  # points that face no view: drawn in every step, for the prior alone to reach them
+
+    @classmethod
+    def all_seen(cls, avatar: GaussianAvatar) -> KnownSurface:
+        ones = torch.ones(len(avatar), device=avatar.device)
+        return cls(SurfacePrior(ones.new_empty(0, 2, dtype=torch.int32), ones[:0]), ones, np.empty(0, np.int64))
+
+    @classmethod
+    def of(cls, avatar: GaussianAvatar, training: TrainingSet) -> KnownSurface:
+        sightings = training.sightings[FINE]
+        texel = nearest_texels(sightings.texels, avatar.texels.uv)
+        shown = sightings.visibility.seen[texel] / max(len(training.views), 1)
+        points, normals = avatar.canonical_points.cpu().numpy(), avatar.normals.cpu().numpy()
+        config = avatar.config.prior
+        prior = SurfacePrior.of(points, normals, shown, config.views, config.power)
+        evident = torch.from_numpy((shown > 0).astype(np.float32))
+        unfaced = np.flatnonzero(sightings.visibility.faced[texel] == 0) if config.on else np.empty(0, np.int64)
+        return cls(prior.to(avatar.device), evident.to(avatar.device), unfaced)
+
+
+def loss_of(avatar: GaussianAvatar, target: Target, background: tuple[float, float, float], step: int = 0) -> Tensor:
+    """`initial_loss` of what the avatar shows of a target, and in some steps 1 - SSIM over visible person pixels."""
     drawn = draw(avatar, target, background)
-    loss = initial_loss(avatar, drawn, target)
-    if not avatar.config.one_fit:
+    loss, weight = initial_loss(avatar, drawn, target), ssim_weight(avatar.config, avatar.config.ssim, step)
+    if weight == 0 or avatar.config.paper_strict:
         return loss
     unknown = 1 - target.person - target.background
-    return loss + ONE_FIT_SSIM * dissimilarity(*where_known(drawn.rgb, target.image, unknown), target.person)
+    return loss + weight * dissimilarity(*where_known(drawn.rgb, target.image, unknown), target.person)
+
+
+def ssim_weight(config: InpaintHumanConfig, weight: float, step: int) -> float:
+    """The weight of the SSIM in this step: all of it in one of `ssim_every`, where it is paid for."""
+    return weight * config.ssim_every if (step + 1) % config.ssim_every == 0 else 0.0
 
 
 def parameter_groups(avatar: GaussianAvatar, lr_share: float = 1.0, maps_only: bool = False) -> list[ParameterGroup]:
@@ -160,10 +214,11 @@ class Stage1(Optimisation[GaussianAvatar]):
             lr_final=config.lr_final,
             clip_gradient=config.clip_gradient,
         )
-        self._targets = LazyViews(lambda k: prepare_target(avatar, views[k]), len(views), held=TARGETS_HELD)
+        surface = KnownSurface.of(avatar, training)
+        self._targets = LazyViews(lambda k: prepare_target(avatar, views[k], surface), len(views), held=TARGETS_HELD)
 
     def _loss(self, k: int) -> Tensor:
-        return loss_of(self.avatar, self._targets[k], self.training.background)
+        return loss_of(self.avatar, self._targets[k], self.training.background, self.step)
 
     def _before_step(self) -> None:
         self._join_residual(self.step)

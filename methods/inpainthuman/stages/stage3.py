@@ -25,12 +25,14 @@ from ihbench.methods.inpainthuman.stages.refine_loss import (
 )
 from ihbench.methods.inpainthuman.stages.stage1 import (
     TARGETS_HELD,
+    KnownSurface,
     Target,
     draw,
     fitted_window,
     initial_loss,
     parameter_groups,
     prepare_target,
+    ssim_weight,
 )
 from ihbench.scene.contracts import MaskState, TrainingSet, TrainView
 from ihbench.scene.views import LazyViews
@@ -86,6 +88,7 @@ class Stage3(Optimisation[GaussianAvatar]):
             clip_gradient=avatar.config.clip_gradient,
             warm_up=chosen.warm_up,
         )
+        self._surface = KnownSurface.of(avatar, training)
         self._targets = LazyViews(self._target, self.views, held=TARGETS_HELD)
         self._perceptual: Perceptual | None = None
 
@@ -110,7 +113,8 @@ class Stage3(Optimisation[GaussianAvatar]):
         drawn = draw(self.avatar, target.original, background)
         loss = initial_loss(self.avatar, drawn, target.original)
         if self.config.weight > 0:
-            refined = refine_loss(drawn.rgb, target.painted, self.config, self._perceptual)
+            ssim = ssim_weight(self.avatar.config, self.config.ssim, self.step)
+            refined = refine_loss(drawn.rgb, target.painted, replace(self.config, ssim=ssim), self._perceptual)
             loss = loss + self.config.weight * refined
         return loss
 
@@ -132,7 +136,7 @@ class Stage3(Optimisation[GaussianAvatar]):
         rows, cols = slice(y0, y0 + height), slice(x0, x0 + width)
         background, device = self.training.background, self.avatar.device
         return RefineTarget(
-            prepare_target(self.avatar, view),
+            prepare_target(self.avatar, view, self._surface),
             prepare_painted(painted, rows, cols, background, self.config.generated, device),
         )
 

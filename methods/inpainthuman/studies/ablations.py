@@ -7,7 +7,8 @@ from ihbench.runner.ablation import AblationSuite, Comparison, Variant
 
 ONE_LEVEL: Values = {"levels": (128,)}  # the paper does not say which single map its baseline has
 NO_PAINTER: Values = {"inpaint.on": False}
-ONE_FIT: Values = {"one_fit": True}  # what a fit with SSIM and more steps reaches without paintings
+ONE_FIT: Values = {"one_fit": True}  # what a fit with more steps reaches without paintings
+NO_PRIOR: Values = {"prior.color": 0.0, "prior.offset": 0.0, "prior.scale": 0.0}
 # what is left out everywhere, besides what the plan leaves out of a scene
 EVERYTHING: Values = {"cull": False, "crop": False, "inpaint.key_views": 0, "inpaint.always": True}
 NEITHER: Values = {"inpaint.ti": False, "inpaint.sg": False}
@@ -44,7 +45,7 @@ SUITES = {
         (
             Comparison("multi-scale maps", "one level", "MS"),
             Comparison("multi-scale maps, with diffusion", "one level, diffusion", "MS, diffusion"),
-            Comparison("SSIM and more steps", "MS", "MS, one fit"),
+            Comparison("more steps", "MS", "MS, one fit"),
             Comparison("diffusion without a word", "MS", "MS, diffusion"),
             Comparison("the word V* (TI)", "MS, diffusion", "MS + TI"),
             Comparison("diffusion and the word", "MS", "MS + TI"),
@@ -78,6 +79,11 @@ SUITES = {
         "the pose-dependent residual, stage 1 alone",
         (Variant("without", {"pose_residual": False, **NO_PAINTER}), Variant("with", NO_PAINTER)),
         (Comparison("the pose residual", "without", "with"),),
+    ),
+    "prior": AblationSuite(
+        "the smoothness prior, stage 1 alone",
+        (Variant("without", NO_PRIOR | NO_PAINTER), Variant("with", NO_PAINTER)),
+        (Comparison("the smoothness prior", "without", "with"),),
     ),
     "rank": AblationSuite(
         "rank of LoRA on the painter",
