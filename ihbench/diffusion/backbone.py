@@ -34,7 +34,8 @@ class Backbone:
     """The parts, all in eval mode and frozen; personalisation adds to them.
 
     `unet` takes 2 C + 1 channels (noisy latents, mask, latents of the masked image) and gives C; `controlnet` takes
-    C channels and the part map. `size` is the height in px of the crops it was trained on.
+    C channels and the part map, that of `mini` also what other
+    frames show of the surface. `size` is the height in px of the crops it was trained on.
     """
 
     name: str
@@ -92,14 +93,16 @@ class Backbone:
         timesteps: Tensor,  # [B]
         condition: Tensor,  # [B, 1 + C, h, w]
         text: Tensor,  # [B, L, D]
-        parts: Tensor | None,  # [B, 3, H, W] part map in [0, 1]; None leaves the ControlNet out
+        guide: Tensor | None,  # [B, 3 or 7, H, W] in [0, 1], of which the ControlNet takes as many as it knows;
+        # None leaves it out
     ) -> Tensor:
         """What the scheduler's `prediction_type` says: noise, velocity or the clean latents."""
         noisy = noisy.to(self.dtype)  # the autoencoder may be kept in fp32
         residuals: dict[str, Tensor | list[Tensor]] = {}
-        if parts is not None:
+        if guide is not None:
+            guide = guide[:, : self.controlnet.config.conditioning_channels].to(self.dtype)
             down, middle = self.controlnet(
-                noisy, timesteps, encoder_hidden_states=text, controlnet_cond=parts.to(self.dtype), return_dict=False
+                noisy, timesteps, encoder_hidden_states=text, controlnet_cond=guide, return_dict=False
             )
             residuals = {"down_block_additional_residuals": down, "mid_block_additional_residual": middle}
         return self.unet(torch.cat([noisy, condition], 1), timesteps, encoder_hidden_states=text, **residuals).sample

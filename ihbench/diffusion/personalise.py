@@ -18,7 +18,7 @@ from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.diffusion.backbone import Backbone, shrink_mask
 from ihbench.diffusion.crops.crop_view import CropView
-from ihbench.diffusion.crops.diffusion_batch import batch_of, by_width
+from ihbench.diffusion.crops.diffusion_batch import batch_of, by_width, guide_of
 from ihbench.diffusion.crops.push_pull import push_pull
 from ihbench.diffusion.crops.random_mask import SHARES, random_mask
 from ihbench.diffusion.inpaint_config import InpaintConfig
@@ -26,7 +26,8 @@ from ihbench.diffusion.memory import ADVICE, halved
 from ihbench.diffusion.subject_token import ANYBODY, SubjectToken
 from ihbench.errors import BadInput
 
-TI_SHARES = (0.35, 0.10, 0.10, 0.10, 0.10, 0.25)  # kinds of masks: more often everything: the word must say it
+TI_SHARES = (0.25, 0.05, 0.05, 0.05, 0.10, 0.50)  # kinds of masks: mostly everything: the word must say it
+SEEN_KEPT = 0.5  # share of the crops of the adaptation that are given what other frames show of what they paint
 BACKGROUND_WEIGHT = 0.15  # of blocks without the person
 GOOD_EVERY = 20  # steps between two copies to roll back to
 TEXT_LR = 1e-5  # of LoRA on the text encoder
@@ -65,13 +66,13 @@ class Personaliser:
     def prompt(self) -> str:
         return self.token.prompt if self.token is not None else ANYBODY
 
-    def run(self, progress: Progress) -> None:
+    def run(self, progress: Progress, adapt: bool = True) -> None:
         """Learn the word, then adapt; each only when its switch is on."""
         config = self.config
         if config.ti:
             with self.ledger.stage("textual-inversion"):
                 self._invert(progress)
-        if config.lora or config.sg:
+        if adapt and (config.lora or config.sg):
             with self.ledger.stage("adapt"):
                 self._adapt(progress)
 
@@ -203,6 +204,10 @@ class Personaliser:
             [random_mask(rng, view.body if view.body.any() else view.person, shares) for view in chosen]
         )
         hidden = torch.from_numpy(made_up).to(backbone.device)[:, None].float()
+        # where nothing else shows the surface, the model (or in textual inversion the word) must know it
+        kept = np.zeros(len(chosen)) if shares is TI_SHARES else rng.random(len(chosen)) < SEEN_KEPT
+        kept = torch.from_numpy(kept).to(hidden)[:, None, None, None]
+        guide = guide_of(crops.parts, crops.seen * torch.maximum(1 - hidden, kept)) if use_parts else None
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
         with torch.no_grad():
             # behind the real occluder the surroundings go on: its paint must not reach the model as noisy content
@@ -220,7 +225,7 @@ class Personaliser:
             noisy = backbone.scheduler.add_noise(latents, noise, timesteps)
         with torch.autocast(backbone.device.type, self.dtype, enabled=self.dtype != torch.float32):
             text = backbone.text([self.prompt]).expand(len(chosen), -1, -1)
-            predicted = backbone.predict(noisy, timesteps, condition, text, crops.parts if use_parts else None)
+            predicted = backbone.predict(noisy, timesteps, condition, text, guide)
         error = (predicted - backbone.target(latents, noise, timesteps)).float().square()
         per_crop = (error * channel_weight(backbone) * weight).sum((1, 2, 3)) / weight.sum((1, 2, 3)).clamp(min=1)
         return (per_crop / latents.shape[1] * timestep_weight(backbone, timesteps)).mean()

@@ -40,11 +40,11 @@ def sample(
     condition = backbone.condition(batch.pixels.to(backbone.dtype), batch.unknown, batch.person)
     prompts = [prompt] if guidance <= 1 else [prompt, negative]
     text = backbone.text(prompts)
-    parts = batch.parts if use_parts else None
+    guide = batch.guide if use_parts else None
     latents = noise.expand(len(batch), *noise.shape[-3:]).to(backbone.dtype) * scheduler.init_noise_sigma
     for t in scheduler.timesteps:
         given = scheduler.scale_model_input(latents, t)
-        predicted = _predict(backbone, given, t, condition, text, parts, guidance)
+        predicted = _predict(backbone, given, t, condition, text, guide, guidance)
         latents = scheduler.step(predicted, t, latents, return_dict=False)[0]
     return backbone.codec.decode(latents).float().clamp(-1, 1)
 
@@ -55,15 +55,15 @@ def _predict(
     t: Tensor,
     condition: Tensor,
     text: Tensor,
-    parts: Tensor | None,
+    guide: Tensor | None,
     guidance: float,
 ) -> Tensor:
     n = len(noisy)
     times = t.expand(n)
-    said = backbone.predict(noisy, times, condition, text[:1].expand(n, -1, -1), parts)
+    said = backbone.predict(noisy, times, condition, text[:1].expand(n, -1, -1), guide)
     if len(text) == 1:
         return said
-    unsaid = backbone.predict(noisy, times, condition, text[1:].expand(n, -1, -1), parts)
+    unsaid = backbone.predict(noisy, times, condition, text[1:].expand(n, -1, -1), guide)
     return unsaid + guidance * (said - unsaid)
 
 

@@ -77,7 +77,7 @@ def _exact(backbone: Backbone, batch: DiffusionBatch, noise: Tensor, many: int) 
         for part in parts:
             part.double()
         wide = DiffusionBatch(
-            batch.pixels.double(), batch.unknown.double(), batch.person.double(), batch.parts.double()
+            *(t.double() for t in (batch.pixels, batch.unknown, batch.person, batch.parts, batch.seen))
         )
         return _paint(backbone, wide, noise.double(), many).double()
     finally:

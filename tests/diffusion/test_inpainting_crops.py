@@ -14,7 +14,9 @@ from ihbench.camera import Camera, look_at
 from ihbench.diffusion.crops.crop_view import cut_view
 from ihbench.diffusion.crops.part_map import (
     BACK,
+    HEAD,
     NO_PART,
+    PROFILE,
     palette,
     part_colours,
     part_labels,
@@ -98,19 +100,22 @@ class TestPartMap:
         assert left_hip > right_hip  # the person faces the camera: their left is on our right
         assert set(np.unique(labels)) <= {*range(24), NO_PART}
 
-    def test_a_head_from_the_front_is_not_one_from_behind(self, body):
-        def share_of_backs(turn: float) -> float:
-            pose = STANDING.pose.copy()
-            pose[0] = [0, turn, 0]
-            labels = part_labels(body.pose(replace(STANDING, pose=pose)), body, camera())
-            head = labels[smpl_parts(labels) == 15]
-            return float((head >= BACK).mean())
-
-        assert share_of_backs(0.0) < 0.1
-        assert share_of_backs(np.pi) > 0.9
+    @pytest.mark.parametrize(
+        ("turn", "mostly"), [(0.0, 0), (np.pi, BACK), (np.pi / 2, PROFILE), (-np.pi / 2, PROFILE)]
+    )
+    def test_a_head_is_told_from_front_back_and_profile(self, body, turn, mostly):
+        pose = STANDING.pose.copy()
+        pose[0] = [0, turn, 0]
+        labels = part_labels(body.pose(replace(STANDING, pose=pose)), body, camera())
+        head = labels[smpl_parts(labels) == HEAD] - HEAD
+        sides, counts = np.unique(head, return_counts=True)
+        assert set(sides) <= {0, BACK, PROFILE}
+        assert sides[counts.argmax()] == mostly
+        if mostly != PROFILE:
+            assert not (head == BACK - mostly).any()  # nothing of the other side
 
     def test_every_side_of_a_part_has_a_colour_of_its_own(self):
-        assert len(np.unique(palette(), axis=0)) == 48
+        assert len(np.unique(palette(), axis=0)) == 72
         shown = part_colours(np.array([[3, NO_PART]], np.uint8))
         assert (shown[0, 0] == palette()[3]).all()
         assert not shown[0, 1].any()

@@ -171,9 +171,9 @@ def test_sampling_gives_what_the_inpainting_pipeline_of_diffusers_gives(
         height=64, width=64, latents=noise.expand(2, -1, -1, -1).clone(), num_inference_steps=3, guidance_scale=4.0,
         output_type="pt",
     ).images  # fmt: skip
-    batch = DiffusionBatch(
-        pixels=images, unknown=hidden, person=torch.zeros_like(hidden), parts=torch.zeros_like(images)
-    )
+    nothing = torch.zeros_like(images)
+    seen = torch.zeros_like(hidden).expand(-1, 4, -1, -1)
+    batch = DiffusionBatch(pixels=images, unknown=hidden, person=torch.zeros_like(hidden), parts=nothing, seen=seen)
     ours = sample(
         loaded, batch, noise, "a photo of a person", steps=3, use_parts=False, guidance=4.0, negative="dots"
     )

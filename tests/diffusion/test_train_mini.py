@@ -10,12 +10,13 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from ihbench import config_fields
+from ihbench import config_fields, registry
 from ihbench.cli import main
 from ihbench.clock.progress import Progress
 from ihbench.clock.threads import one_torch_thread
 from ihbench.diffusion.crops import crop_dataset
 from ihbench.diffusion.crops.crop_dataset import CropDataset
+from ihbench.diffusion.crops.part_map import NO_PART
 from ihbench.diffusion.mini import batches as mini_batches
 from ihbench.diffusion.mini import model as mini_model
 from ihbench.diffusion.mini import train_mini
@@ -143,14 +144,53 @@ def test_people_come_in_pages(tmp_path, dataset):
 def test_the_loss_sees_the_prompted_traits(tmp_path, dataset):
     """Trait tokens reach the text encoder's output of told prompts alone."""
     trainer = MiniTrainer(MiniTraining(people=2, each=2, traits=1.0, captions=0.0), tmp_path, dataset, QUIET)
-    words = replace(trainer.batches[0], traits=torch.from_numpy(trainer.batches.crops.traits))
+    traits, people = torch.from_numpy(trainer.batches.crops.traits), torch.tensor([0, 1])
+    words = replace(trainer.batches[0], traits=traits, people=people)
     prompts, told = trainer.batches.words(np.random.default_rng(0), np.array([0, 1]))
     assert told == [True, True]
     words = replace(words, ids=trainer.backbone.token_ids(prompts))
     both = trainer._text(replace(words, told=torch.tensor(told)))
     assert not torch.equal(both[0], both[1])
+    alike = replace(words, traits=traits[:1].expand(2, -1), told=torch.tensor(told))
+    both = trainer._text(alike)
+    assert torch.equal(both[0], both[1])
+    with torch.no_grad():
+        trainer.tokens.own.weight[1] = 0.1  # a person is more than their traits
+    both = trainer._text(alike)
+    assert not torch.equal(both[0], both[1])
     both = trainer._text(replace(words, told=torch.tensor([False, False])))
     assert torch.equal(both[0], both[1])
+
+
+def test_of_a_dropped_context_little_is_left(tmp_path, dataset):
+    config = MiniTraining(people=2, each=2, batch=6, context_dropped=1.0, seen=1.0)
+    trainer = MiniTrainer(config, tmp_path, dataset, QUIET)
+    batch = trainer.batches[0]
+    assert not batch.seen.any()
+    shown = (batch.person & ~batch.hidden).sum((1, 2)) / batch.person.sum((1, 2))
+    assert shown.max() < 0.35
+    whole = MiniTrainer(replace(config, context_dropped=0.0), tmp_path / "whole", dataset, QUIET).batches[0]
+    assert whole.seen.any()
+    seen = whole.seen[..., 3] > 0
+    assert not (seen & (whole.labels == NO_PART)).any()  # the surface is the body's
+
+
+def test_a_backbone_that_knew_the_part_map_alone_can_be_trained_on(tmp_path, dataset, monkeypatch):
+    """Its guide's new channels weigh nothing at first: it answers as before."""
+    monkeypatch.setattr(mini_model, "GUIDE_CHANNELS", 3)
+    narrow = mini_model.new_mini(registry.load("people", "procedural").vocabulary(), 0)
+    save_mini(narrow, tmp_path / "narrow")
+    monkeypatch.setattr(mini_model, "GUIDE_CHANNELS", 7)
+    trainer = MiniTrainer(SMALL, tmp_path / "new", dataset, QUIET, start=tmp_path / "narrow")
+    earlier = load_mini(tmp_path / "narrow")
+    guide = torch.rand(1, 7, SIDE, SIDE)
+    noisy = torch.rand(1, earlier.codec.channels, SIDE // 4, SIDE // 4)
+    condition = torch.rand(1, 1 + earlier.codec.channels, SIDE // 4, SIDE // 4)
+    asked = (noisy, torch.tensor([10]), condition, earlier.text(["a photo of a person"]).detach(), guide)
+    for network in (earlier.controlnet, trainer.backbone.controlnet):
+        torch.nn.init.ones_(network.controlnet_mid_block.weight)  # of zeros before any training
+    with torch.no_grad():
+        torch.testing.assert_close(trainer.backbone.predict(*asked), earlier.predict(*asked))
 
 
 def test_an_album_is_made_where_processes_cannot_share_memory(tmp_path, monkeypatch):

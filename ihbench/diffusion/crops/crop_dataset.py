@@ -17,13 +17,15 @@ from ihbench import registry
 from ihbench.body import load_body
 from ihbench.clock.interruption import end_with_parent
 from ihbench.clock.progress import Progress
-from ihbench.diffusion.crops.part_map import part_labels
+from ihbench.diffusion.crops.part_map import drawn_body, labels_of
 from ihbench.diffusion.crops.person_crop import PADDING, person_crop
+from ihbench.diffusion.crops.seen_surface import NOWHERE, uv_cells
 from ihbench.errors import BadInput
 from ihbench.files.npz import read_npz, write_npz
 
-VERSION = 2  # of what is kept of a photograph
+VERSION = 3  # of what is kept of a photograph
 PAGE = 100  # people per file
+COLUMNS = ("widths", "images", "silhouettes", "parts", "cells", "person")  # one row a crop
 JITTER = 0.03  # of the body's longer side, by which the padding varies
 
 
@@ -35,6 +37,7 @@ class Page:
     images: NDArray[np.uint8]  # [N, S, S, 3]
     silhouettes: NDArray[np.bool_]  # [N, S, S]
     parts: NDArray[np.uint8]  # [N, S, S] SMPL parts
+    cells: NDArray[np.uint16]  # [N, S, S] of the UV chart
     person: NDArray[np.int64]  # [N]
     phrases: list[tuple[str, ...]]  # per person
     traits: NDArray[np.float32]  # [P, T] per person
@@ -43,7 +46,7 @@ class Page:
 def make_page(people: str, start: int, count: int, each: int, size: int) -> Page:
     """Draw `count` people from number `start`, and crop `each` photographs of every one."""
     draw_person, body = registry.load("people", people).draw_person, load_body()
-    columns: dict[str, list[Any]] = {name: [] for name in ("widths", "images", "silhouettes", "parts", "person")}
+    columns: dict[str, list[Any]] = {name: [] for name in COLUMNS}
     phrases, traits = [], []
     for k in range(count):
         person = draw_person(start + k, body, each)
@@ -55,11 +58,12 @@ def make_page(people: str, start: int, count: int, each: int, size: int) -> Page
             padding = PADDING + JITTER * rng.uniform(-1, 1)
             crop = person_crop(shot.camera, vertices, size, padding=padding)
             padded = ((0, 0), (0, size - crop.width))
-            labels = part_labels(vertices, body, crop.camera(shot.camera))
+            raster = drawn_body(vertices, body, crop.camera(shot.camera))
             columns["widths"].append(crop.width)
             columns["images"].append(np.pad(crop.cut(shot.image, 255), (*padded, (0, 0))))
             columns["silhouettes"].append(np.pad(crop.cut(shot.silhouette) > 0.5, padded))
-            columns["parts"].append(np.pad(labels, padded))
+            columns["parts"].append(np.pad(labels_of(raster, body), padded))
+            columns["cells"].append(np.pad(uv_cells(raster, body), padded, constant_values=NOWHERE))
             columns["person"].append(k)
     arrays = {name: np.array(values) for name, values in columns.items()}
     return Page(**arrays, phrases=phrases, traits=np.array(traits, np.float32))
@@ -104,7 +108,7 @@ def _write_page(work: tuple[str, int, int, int, Path]) -> None:
     people, start, each, size, path = work
     page = make_page(people, start, PAGE, each, size)
     words = np.array(["\n".join(phrases) for phrases in page.phrases])
-    arrays = {name: getattr(page, name) for name in ("widths", "images", "silhouettes", "parts", "person", "traits")}
+    arrays = {name: getattr(page, name) for name in (*COLUMNS, "traits")}
     write_npz(path, {"phrases": words, **arrays})
 
 

@@ -12,8 +12,9 @@ from ihbench.body import Body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.clock.progress import Progress
-from ihbench.diffusion.crops.part_map import NO_PART, part_labels
+from ihbench.diffusion.crops.part_map import NO_PART, drawn_body, labels_of
 from ihbench.diffusion.crops.person_crop import PersonCrop, person_crop
+from ihbench.diffusion.crops.seen_surface import Cells, seen_elsewhere, uv_cells
 from ihbench.scene.contracts import MaskState, TrainView
 
 EDGE = 1e-6  # share of a crop's pixel above which it counts
@@ -28,9 +29,11 @@ class CropView:
     person: NDArray[np.bool_]  # [S, W] known, and mostly visible person
     unknown: NDArray[np.bool_]  # [S, W]
     parts: NDArray[np.uint8]  # [S, W] SMPL part of the posed body, 255 off it
+    cells: Cells  # [S, W] of the body's UV chart
     crop: PersonCrop
     camera: Camera  # of the crop
     body_pose: BodyPose
+    elsewhere: NDArray[np.uint8] | None = None  # [S, W, 4] RGB of surface that other frames show, and 255 there
 
     @property
     def body(self) -> NDArray[np.bool_]:
@@ -57,8 +60,15 @@ def cut_view(view: TrainView, index: int, body: Body, size: int, square: bool = 
     unknown = crop.cut(view.mask == MaskState.UNKNOWN) > EDGE
     person = crop.cut(view.mask == MaskState.PERSON) >= 0.5
     camera = crop.camera(view.camera)
-    parts = part_labels(vertices, body, camera)
-    return CropView(index, image, person & ~unknown, unknown, parts, crop, camera, view.body_pose)
+    raster = drawn_body(vertices, body, camera)
+    parts, cells = labels_of(raster, body), uv_cells(raster, body)
+    return CropView(index, image, person & ~unknown, unknown, parts, cells, crop, camera, view.body_pose)
+
+
+def with_elsewhere(views: list[CropView], frames: list[CropView]) -> list[CropView]:
+    """The views, each with what the other frames show of its surface."""
+    drawn = seen_elsewhere(views, frames)
+    return [replace(view, elsewhere=seen) for view, seen in zip(views, drawn, strict=True)]
 
 
 def with_frames(asked: list[CropView], frames: list[CropView]) -> list[CropView]:

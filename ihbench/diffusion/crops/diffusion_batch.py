@@ -21,9 +21,20 @@ class DiffusionBatch:
     unknown: Tensor  # [B, 1, H, W] 1 where the truth is not known
     person: Tensor  # [B, 1, H, W] 1 where a pixel is known to show the person
     parts: Tensor  # [B, 3, H, W] part map in [0, 1]
+    seen: Tensor  # [B, 4, H, W] RGB in [0, 1] of surface that other frames show, and 1 there
 
     def __len__(self) -> int:
         return len(self.pixels)
+
+    @property
+    def guide(self) -> Tensor:
+        """[B, 7, H, W] what guides the ControlNet: the part map, then what other frames show."""
+        return guide_of(self.parts, self.seen)
+
+
+def guide_of(parts: Tensor, seen: Tensor) -> Tensor:
+    """[B, 7, H, W] of a part map [B, 3, H, W] and of what other frames show [B, 4, H, W]."""
+    return torch.cat([parts, seen], 1)
 
 
 def batch_of(views: list[CropView], device: torch.device) -> DiffusionBatch:
@@ -31,11 +42,14 @@ def batch_of(views: list[CropView], device: torch.device) -> DiffusionBatch:
     images = np.stack([view.image for view in views])
     unknown = np.stack([view.unknown for view in views])[:, None]
     colours = part_colours(np.stack([view.parts for view in views]))
+    nothing = np.zeros((*views[0].parts.shape, 4), np.uint8)
+    seen = np.stack([nothing if view.elsewhere is None else view.elsewhere for view in views])
     return DiffusionBatch(
         pixels=torch.from_numpy(images).to(device).movedim(-1, 1).float() / 127.5 - 1,
         unknown=torch.from_numpy(unknown).to(device).float(),
         person=torch.from_numpy(np.stack([view.person for view in views])[:, None]).to(device).float(),
         parts=torch.from_numpy(colours).to(device).movedim(-1, 1).float() / 255,
+        seen=torch.from_numpy(seen).to(device).movedim(-1, 1).float() / 255,
     )
 
 

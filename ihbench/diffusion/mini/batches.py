@@ -15,12 +15,16 @@ from torch.utils.data import DataLoader, Dataset
 from ihbench.diffusion.backbone import padded_ids
 from ihbench.diffusion.crops.crop_dataset import Page
 from ihbench.diffusion.crops.random_mask import random_mask
+from ihbench.diffusion.crops.seen_surface import SurfaceColours
 from ihbench.diffusion.mini.model import SIZE
 from ihbench.diffusion.mini.training import MiniTraining
 
 PERSON = "a photo of a person"
 TRAIT_TOKENS = 4
 USUAL_WIDTH = 0.75  # of a crop, as a share of its height
+STRIPS = (0.7, 0.15, 0.15, 0.0, 0.0, 0.0)  # kinds of occluders of the other photographs
+LEFT = 0.15  # of the crop's sides, that a dropped context leaves at most
+NOT_IN_HIDDEN = 0.35  # share of the crops whose hidden surface no other photograph shows
 
 
 class Crops:
@@ -31,6 +35,7 @@ class Crops:
         self.pages = pages
         self.phrases = [phrases for page in pages for phrases in page.phrases]
         self.traits = np.concatenate([page.traits for page in pages])
+        self.of_person = [[np.flatnonzero(page.person == k) for k in range(len(page.phrases))] for page in pages]
         self.by_width: dict[int, NDArray[np.int64]] = {}  # [n, 3] page, crop, person
         for width in np.unique(np.concatenate([page.widths for page in pages])):
             rows = []
@@ -64,12 +69,14 @@ class MiniBatch:
     """One step's crops, occluders, words, and the seed of its noise, which is drawn where it is used."""
 
     images: Tensor  # [B, S, W, 3] uint8
+    seen: Tensor  # [B, S, W, 4] uint8 RGB of surface that other photographs show, and 255 there
     person: Tensor  # [B, S, W] bool
     hidden: Tensor  # [B, S, W] bool
     labels: Tensor  # [B, S, W] uint8
     timesteps: Tensor  # [B]
     traits: Tensor  # [B, T]
-    told: Tensor  # [B] bool: the traits speak in the place of words
+    people: Tensor  # [B]
+    told: Tensor  # [B] bool: the person's word vectors stand in the place of words
     ids: Tensor  # [B, L] the prompts
     noise_seed: int
     use_parts: bool
@@ -98,18 +105,42 @@ class Batches(Dataset[MiniBatch]):
         rng = np.random.default_rng((config.seed, step))
         width, rows = self.crops.draw(rng, config.batch)
         images, person, labels = self.crops.images(width, rows)
-        hidden = np.stack([random_mask(rng, silhouette) for silhouette in person])
+        dropped = rng.random(len(rows)) < config.context_dropped
+        hidden = np.stack([(nearly_all if d else random_mask)(rng, s) for s, d in zip(person, dropped, strict=True)])
+        seen = np.stack([self.seen(rng, row, width, h) for row, h in zip(rows, hidden, strict=True)])
+        seen[dropped] = 0  # or it would say who it is
         use_parts = bool(rng.random() < config.control)
         prompts, captioned = self.words(rng, rows[:, 2])
         return MiniBatch(
-            *(torch.from_numpy(array) for array in (images, person, hidden, labels)),
+            *(torch.from_numpy(array) for array in (images, seen, person, hidden, labels)),
             timesteps=torch.from_numpy(rng.integers(0, self.timesteps, len(rows))),
             traits=torch.from_numpy(self.crops.traits[rows[:, 2]]),
+            people=torch.from_numpy(rows[:, 2]),
             told=torch.tensor(captioned),
             ids=padded_ids(self.tokenizer, prompts, self.max_tokens),
             noise_seed=int(rng.integers(2**62)),
             use_parts=use_parts,
         )
+
+    def seen(
+        self, rng: np.random.Generator, row: NDArray[np.int64], width: int, hidden: NDArray[np.bool_]
+    ) -> NDArray[np.uint8]:
+        """[S, W, 4] a crop's surface as some of the person's other photographs show it, from behind occluders of
+        their own; nothing in a share of the crops, and in a further share nothing of what is hidden."""
+        page, crop = self.crops.pages[row[0]], row[1]
+        cells = page.cells[crop, :, :width]
+        if rng.random() >= self.config.seen:
+            return np.zeros((*cells.shape, 4), np.uint8)
+        others = self.crops.of_person[row[0]][page.person[crop]]
+        others = rng.permutation(others[others != crop])
+        known = SurfaceColours()
+        for other in others[: rng.integers(1, len(others) + 1)] if len(others) else ():
+            person = page.silhouettes[other]
+            known.show(page.cells[other], page.images[other], person & ~random_mask(rng, person, STRIPS))
+        out = known.drawn(cells)[0]
+        if rng.random() < NOT_IN_HIDDEN:
+            out[hidden] = 0
+        return out
 
     def words(self, rng: np.random.Generator, people: NDArray[np.int64]) -> tuple[list[str], list[bool]]:
         """A prompt for each, and whether trait tokens speak in it."""
@@ -140,3 +171,14 @@ class Batches(Dataset[MiniBatch]):
                 prefetch_factor=4 if workers else None,
             )
         )
+
+
+def nearly_all(rng: np.random.Generator, person: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """[H, W] a mask that hides everything, or leaves a small window about one of the person's pixels."""
+    out = np.ones(person.shape, bool)
+    rows, cols = np.nonzero(person)
+    if len(rows) and rng.random() < 0.5:
+        k = int(rng.integers(len(rows)))
+        h, w = (rng.uniform(0.03, LEFT, 2) * person.shape).astype(int)
+        out[max(rows[k] - h // 2, 0) : rows[k] + h // 2 + 1, max(cols[k] - w // 2, 0) : cols[k] + w // 2 + 1] = False
+    return out

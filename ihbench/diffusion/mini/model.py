@@ -13,6 +13,7 @@ SIZE = 128  # px, height of a crop
 TEXT_WIDTH = 128
 MAX_TOKENS = 40
 CHANNELS = (64, 128, 128)  # at 32², 16², 8²
+GUIDE_CHANNELS = 7  # the part map, and what other frames show of the surface: RGB and where
 BLANK, START, END, UNKNOWN = "[blank]", "[start]", "[end]", "[unknown]"
 
 
@@ -41,7 +42,10 @@ def new_mini(words: tuple[str, ...], seed: int) -> Backbone:
             **shape,
         )
         controlnet = ControlNetModel(
-            in_channels=codec.channels, conditioning_embedding_out_channels=(8, 16, 32), **shape
+            in_channels=codec.channels,
+            conditioning_channels=GUIDE_CHANNELS,
+            conditioning_embedding_out_channels=(8, 16, 32),
+            **shape,
         )
         text_encoder = CLIPTextModel(
             CLIPTextConfig(

@@ -20,9 +20,10 @@ from ihbench import registry
 from ihbench.clock.progress import Progress
 from ihbench.diffusion.backbone import Backbone, shrink_mask
 from ihbench.diffusion.crops.crop_dataset import PAGE, CropDataset
-from ihbench.diffusion.crops.part_map import part_colours
+from ihbench.diffusion.crops.diffusion_batch import guide_of
+from ihbench.diffusion.crops.part_map import HEAD, N_PARTS, NO_PART, part_colours
 from ihbench.diffusion.mini.batches import TRAIT_TOKENS, Batches, Crops, MiniBatch
-from ihbench.diffusion.mini.model import SIZE, TEXT_WIDTH, new_mini
+from ihbench.diffusion.mini.model import GUIDE_CHANNELS, SIZE, TEXT_WIDTH, new_mini
 from ihbench.diffusion.mini.training import MiniTraining
 from ihbench.diffusion.mini.weights import load_mini
 from ihbench.errors import BadInput, Diverged
@@ -32,6 +33,7 @@ STATE = "training.safetensors"
 CURVE = "curve.jsonl"
 TRAINED = ("unet", "controlnet", "text_encoder")
 RISE = 200  # steps of warming up
+GUIDE = "controlnet_cond_embedding.conv_in.weight"
 
 
 def curve_of(folder: Path) -> list[dict[str, float]]:
@@ -40,18 +42,21 @@ def curve_of(folder: Path) -> list[dict[str, float]]:
     return [row for _, row in sorted({row["step"]: row for row in rows}.items())]
 
 
-class TraitTokens(nn.Module):
-    """Turns a person's traits into word vectors in the place of V*: only training has them. It makes the room of word
-    vectors hold whole outfits, so that a V* found by gradient descent can say one."""
+class PersonTokens(nn.Module):
+    """Word vectors of the training people in the place of V*: only training has them. What their traits say, plus a
+    row of each person's own, learned like textual inversion learns V*. It makes the space of word vectors hold whole
+    outfits and persons, so that a V* found by gradient descent can say one."""
 
-    def __init__(self, n_traits: int):
+    def __init__(self, n_traits: int, people: int):
         super().__init__()
+        self.own = nn.Embedding(people, TRAIT_TOKENS * TEXT_WIDTH)
+        nn.init.zeros_(self.own.weight)
         first, last = nn.Linear(n_traits, 128), nn.Linear(128, TRAIT_TOKENS * TEXT_WIDTH)
         nn.init.normal_(last.weight, std=0.01)
         self.net = nn.Sequential(first, nn.SiLU(), last)
 
-    def forward(self, traits: Tensor) -> Tensor:  # [B, T] -> [B, TRAIT_TOKENS, TEXT_WIDTH]
-        return self.net(traits).reshape(len(traits), TRAIT_TOKENS, TEXT_WIDTH)
+    def forward(self, traits: Tensor, people: Tensor) -> Tensor:  # [B, T], [B] -> [B, TRAIT_TOKENS, TEXT_WIDTH]
+        return (self.net(traits) + self.own(people)).reshape(len(traits), TRAIT_TOKENS, TEXT_WIDTH)
 
 
 class MiniTrainer:
@@ -80,7 +85,7 @@ class MiniTrainer:
             self._begin_from(load_mini(start))
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed + 1)
-            self.tokens = TraitTokens(people.N_TRAITS)
+            self.tokens = PersonTokens(people.N_TRAITS, config.people)
         timesteps = self.backbone.scheduler.config.num_train_timesteps
         self.batches = Batches(config, crops, timesteps, self.backbone.tokenizer, self.backbone.max_tokens)
         self.modules = {name: getattr(self.backbone, name) for name in TRAINED} | {"tokens": self.tokens}
@@ -93,9 +98,12 @@ class MiniTrainer:
             f"{part}.{name}": p for part, module in self.modules.items() for name, p in module.named_parameters()
         }
         self.mean = {name: p.detach().clone() for name, p in self.named.items()}
+        own = self.tokens.own.weight
+        rest = [p for p in self.named.values() if p is not own]
         self.optimizer = torch.optim.AdamW(
-            list(self.named.values()), lr=config.lr, betas=(0.9, 0.99), weight_decay=0.01, fused=True
-        )
+            [{"params": rest, "times": 1.0}, {"params": [own], "times": config.table_lr}],
+            lr=config.lr, betas=(0.9, 0.99), weight_decay=0.01, fused=True,
+        )  # fmt: skip
         self.step, self.seconds = 0, 0.0
         self._traits: Tensor | None = None
         self.backbone.text_encoder.get_input_embeddings().register_forward_hook(self._say_traits)
@@ -109,8 +117,11 @@ class MiniTrainer:
         if earlier.tokenizer.get_vocab() != self.backbone.tokenizer.get_vocab():
             raise BadInput("--start: a backbone that knows other words than these people's captions have")
         for name in (*TRAINED, "codec"):
+            state = getattr(earlier, name).state_dict()
+            if name == "controlnet":
+                state[GUIDE] = _widened(state[GUIDE], GUIDE_CHANNELS)
             try:
-                getattr(self.backbone, name).load_state_dict(getattr(earlier, name).state_dict())
+                getattr(self.backbone, name).load_state_dict(state)
             except RuntimeError as error:
                 raise BadInput(f"--start: its {name} has another shape ({str(error).splitlines()[0]})") from error
 
@@ -158,7 +169,7 @@ class MiniTrainer:
 
     def _one_step(self, batch: MiniBatch) -> float:
         for group in self.optimizer.param_groups:
-            group["lr"] = self._rate()
+            group["lr"] = self._rate() * group["times"]
         self.optimizer.zero_grad(set_to_none=True)
         loss = self.loss(batch)
         value = loss.item()
@@ -183,19 +194,24 @@ class MiniTrainer:
         generator = torch.Generator(device).manual_seed(batch.noise_seed)
         noise = torch.randn(latents.shape, generator=generator, device=device)
         noisy = backbone.scheduler.add_noise(latents, noise, timesteps)
-        parts = self.colours[batch.labels.long()].movedim(-1, 1) if batch.use_parts else None
+        guide = None
+        if batch.use_parts:
+            seen = batch.seen.movedim(-1, 1).float() / 255
+            guide = guide_of(self.colours[batch.labels.long()].movedim(-1, 1), seen)
         condition = backbone.condition(pixels, hidden, person)
         with torch.autocast(device.type, torch.bfloat16, enabled=self.config.precision == "bfloat16"):
-            predicted = backbone.predict(noisy, timesteps, condition, self._text(batch), parts).float()
+            predicted = backbone.predict(noisy, timesteps, condition, self._text(batch), guide).float()
         body = shrink_mask(person, latents)
         weight = shrink_mask(hidden, latents)
         weight = weight * (self.config.background_weight + (1 - self.config.background_weight) * body)
+        head = shrink_mask((batch.labels % N_PARTS == HEAD)[:, None] & (batch.labels != NO_PART)[:, None], latents)
+        weight = weight * (1 + (self.config.head_weight - 1) * head)
         error = ((predicted - backbone.target(latents, noise, timesteps)).square() * self.channel_weight).mean(1)
         per_sample = (error * weight[:, 0]).sum((1, 2)) / weight.sum((1, 2, 3)).clamp(min=1)
         return (per_sample * backbone.snr(timesteps).clamp(1, 5)).mean()
 
     def _text(self, batch: MiniBatch) -> Tensor:
-        self._traits, self._told = self.tokens(batch.traits), batch.told
+        self._traits, self._told = self.tokens(batch.traits, batch.people), batch.told
         try:
             return self.backbone.text_of(batch.ids)
         finally:
@@ -263,3 +279,9 @@ class MiniTrainer:
     def _note(self, row: dict[str, float]) -> None:
         path = self.folder / CURVE
         atomic.write_json_lines(path, [*(atomic.read_json_lines(path) if path.is_file() else ()), row])
+
+
+def _widened(weight: Tensor, channels: int) -> Tensor:
+    """[O, I, 3, 3] with so many inputs, the new ones of no weight: a ControlNet that knew the part map alone."""
+    more = max(channels - weight.shape[1], 0)
+    return torch.cat([weight, weight.new_zeros(len(weight), more, *weight.shape[2:])], 1)

@@ -29,7 +29,8 @@ class MiniTraining:
     average: Annotated[float, Within(0, 1)] = 0.999
     """Decay of the running mean of the weights, which is what is kept."""
     traits: Annotated[float, Within(0, 1)] = 0.40
-    """Share of the samples whose person is told by trait tokens, the room in which V* is looked for."""
+    """Share of the samples whose person is told by word vectors, of their traits and of their own: the space in which
+    V* is looked for."""
     captions: Annotated[float, Within(0, 1)] = 0.35
     """Share that has a caption; the rest has "a photo of a person"."""
     phrase_kept: Annotated[float, Within(0, 1)] = 0.7
@@ -38,6 +39,14 @@ class MiniTraining:
     """Share of the steps with the part map."""
     background_weight: Annotated[float, Within(0, 1000)] = 0.15
     """Weight of hidden blocks without the person."""
+    head_weight: Annotated[float, Within(0, 1000)] = 3.0
+    """Weight of hidden blocks that show the head, which is small and of which most is known least."""
+    context_dropped: Annotated[float, Within(0, 1)] = 0.25
+    """Share of the crops of which all but a small piece is hidden: who it is can come from the words alone."""
+    seen: Annotated[float, Within(0, 1)] = 0.8
+    """Share of the crops that are given surface which the person's other photographs show."""
+    table_lr: Annotated[float, Within(0, 1000)] = 20.0
+    """Step size of the people's own word vectors, as a multiple of `lr`; 0 leaves them out."""
     save_every: Annotated[float, Within(0, 1e6)] = 240.0
     """Seconds between two saved states."""
 

@@ -12,7 +12,7 @@ from ihbench.clock.checkpoints import Tensors
 from ihbench.clock.events import Inpainted, LeftOut, LossCurve, Resumed
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.diffusion.crops.crop_view import CropView, Inpainter, cut_view, with_frames
+from ihbench.diffusion.crops.crop_view import CropView, Inpainter, cut_view, with_elsewhere, with_frames
 from ihbench.diffusion.inpaint_config import InpaintConfig
 from ihbench.methods.inpainthuman.avatar.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.inpainting.painted_view import PaintedView, paste_back
@@ -59,6 +59,8 @@ class Stage2:
             filmed = with_frames(crops, frames)
         diffusion = cast("DiffusionInpainter", inpainter) if self.config.filler == "diffusion" else None
         if diffusion is not None:
+            with self.ledger.stage("look"):
+                crops, frames = with_elsewhere(crops, frames), with_elsewhere(frames, frames)
             diffusion.learn(frames, progress)
         if not crops:
             return self._nothing("nothing needed painting; personalised as asked")
