@@ -55,11 +55,12 @@ class DiffusionInpainter:
         self.prompt = ANYBODY
         self.curves: dict[str, Curve] = {}
 
-    def learn(self, views: list[CropView], progress: Progress) -> None:
-        """Personalise, as far as the switches ti, lora and sg ask for it. Changes the backbone."""
+    def learn(self, views: list[CropView], progress: Progress, adapt: bool = True) -> None:
+        """Personalise, as far as the switches ti, lora and sg ask for it; without `adapt` the word alone. Changes the
+        backbone."""
         if self.config.ti or self.config.lora or self.config.sg:
             person = Personaliser(self.backbone, views, self.config, self.seed, self.ledger)
-            person.run(progress)
+            person.run(progress, adapt)
             self.prompt, self.curves = person.prompt, person.curves
 
     def inpaint(self, views: list[CropView], progress: Progress) -> list[NDArray[np.uint8]]:

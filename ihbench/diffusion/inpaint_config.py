@@ -18,6 +18,8 @@ COMPONENTS: dict[str, tuple[bool, bool, bool]] = {
     "generic": (False, False, False),
     "generic+sg": (False, False, True),
     "ti": (True, False, False),
+    "ti+sg": (True, False, True),
+    "lora+sg": (False, True, True),
     "ti+lora": (True, True, False),
     "ti+lora+sg": (True, True, True),
 }

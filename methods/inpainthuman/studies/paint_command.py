@@ -29,6 +29,9 @@ class PaintOptions(ProtocolChanges, Report):
     """Painters to compare."""
     frames: Annotated[int, Within(1, 100_000)] = 20
     """Training frames painted, evenly spread; personalisation sees all."""
+    dropped: Annotated[float, Within(0, 1)] = 0.0
+    """Share of the visible person that a frame keeps from the painters, and all that other frames show: how much they
+    know of who it is. They learn from whole frames; scored are the same pixels."""
     seed: Annotated[tuple[int, ...], SEEDS] = (0,)
     """Seeds; their scores are averaged per scene before anything else."""
     device: Literal["cpu", "cuda"] = "cpu"
@@ -78,7 +81,7 @@ def main(argv: list[str]) -> int:
         data = capture.standin or capture.variant
         scenes[scene], picture = paint_scene(
             capture, body, protocols[0], chosen.rows, chosen.frames, chosen.seed, chosen.inpaint, progress,
-            chosen.device,
+            chosen.device, chosen.dropped,
         )  # fmt: skip
         if chosen.out is not None:
             outputs.write_bytes(chosen.out / f"{scene}.png", encoded(picture, "PNG"))

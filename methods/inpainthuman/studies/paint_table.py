@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ihbench.body import Body
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.diffusion.crops.crop_view import cut_view
+from ihbench.diffusion.crops.crop_view import CropView, cut_view, with_elsewhere
 from ihbench.diffusion.inpaint_config import COMPONENTS, FULL, SIMPLE, InpaintConfig
 from ihbench.document.document import Block, Heading, Table
 from ihbench.errors import BadInput
@@ -37,16 +37,22 @@ def paint_scene(
     config: InpaintConfig,
     progress: Progress,
     device: str = "cpu",
+    dropped: float = 0.0,
 ) -> tuple[dict[str, dict[str, float]], NDArray[np.uint8]]:
     """Row -> scores over the scene's hidden pixels, and a picture. Two more rows bound drift and flicker: the true
-    images as a painting, and surface that is seen. Raises `BadInput` when nothing is hidden."""
+    images as a painting, and surface that is seen. A share `dropped` of what a frame shows of the person is kept from
+    the painters, and all that other frames show; scored are the same pixels. Raises `BadInput` when nothing is
+    hidden."""
     from ihbench.methods.inpainthuman.studies.drift import flicker, hidden_scores, identity_drift
 
     def paint(row: str, seed: int, ledger: Ledger) -> list[NDArray[np.uint8]]:
         if row in SIMPLE:
             from ihbench.methods.inpainthuman.inpainting.simple_inpainters import simple_inpainters
 
-            painted = simple_inpainters(body, protocol.image.background)[row].inpaint(views, progress)
+            given = [
+                replace(view, unknown=few.unknown, person=few.person) for view, few in zip(views, shown, strict=True)
+            ]
+            painted = simple_inpainters(body, protocol.image.background)[row].inpaint(given, progress)
             return [painted[k] for k in picked]
         from ihbench.diffusion.diffusion_inpainter import DiffusionInpainter, load_backbone
 
@@ -54,8 +60,8 @@ def paint_scene(
         switched = replace(config, ti=ti, lora=lora, sg=sg)
         inpainter = DiffusionInpainter(load_backbone(switched, device), switched, seed, ledger)
         if ti or lora:  # a generic model learns nothing of the person, its ControlNet neither
-            inpainter.learn(views, progress)
-        return inpainter.inpaint(asked, progress)
+            inpainter.learn(views, progress, adapt=lora)
+        return inpainter.inpaint([shown[k] for k in picked], progress)
 
     size, square = SIZES[config.backbone]
     scene = open_scene(capture, protocol)
@@ -66,6 +72,8 @@ def paint_scene(
             views.append(cut_view(occluded[k], k, body, size, square))
             truths.append(cut_view(whole[k], k, body, size, square))
             task.advance(2)
+    views = with_elsewhere(views, views)
+    shown = [with_less(view, dropped) for view in views] if dropped else views
     hiding = [k for k, view in enumerate(views) if view.unknown.any()]
     if not hiding:
         raise BadInput(f"scene {capture.name}: no training frame hides anything under {protocol.name}")
@@ -96,6 +104,15 @@ def paint_scene(
     means[SEEN] = {"delta_e": drift.delta_e_floor, "flicker": flick.deviation_floor}
     masked = [np.where(view.unknown[..., None], np.uint8(128), view.image) for view in asked]
     return means, np.concatenate([_row(truth_images), _row(masked), *pictures.values()], 0)
+
+
+def with_less(view: CropView, dropped: float) -> CropView:
+    """A view of which only a strip on one side is left, so wide that it shows a share 1 - `dropped` of the visible
+    person, and nothing of other frames."""
+    columns = np.cumsum(view.person.sum(0))
+    kept = np.arange(len(columns)) < np.searchsorted(columns, (1 - dropped) * columns[-1])
+    unknown = view.unknown | ~kept
+    return replace(view, unknown=unknown, person=view.person & ~unknown, elsewhere=None)
 
 
 def _evenly(items: Sequence[T], most: int) -> list[T]:
