@@ -78,6 +78,9 @@ class InpaintHumanConfig:
     """Share of the steps after which the residual joins; earlier it would absorb what belongs to the maps."""
     background_weight: Annotated[float, WEIGHT] = 1.0
     """Weight of the L1 on pixels known to be background. Without it nothing bounds the silhouette."""
+    background_rim: Annotated[float, Within(0, 1)] = 0.04
+    """Known background is not learned nearer to unknown pixels than this share of the longer side of the body's
+    window."""
     offset_weight: Annotated[float, WEIGHT] = 10.0
     """Weight of the mean squared offset in m² of points that some training view shows (GaussianAvatar)."""
     scale_weight: Annotated[float, WEIGHT] = 0.03

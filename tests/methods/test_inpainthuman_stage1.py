@@ -18,6 +18,7 @@ from ihbench.methods.inpainthuman.method import InpaintHuman
 from ihbench.methods.inpainthuman.stages.stage1 import (
     KnownSurface,
     Stage1,
+    beside,
     body_window,
     loss_of,
     prepare_target,
@@ -112,13 +113,16 @@ def test_the_strict_loss_is_the_mean_error_of_the_visible_pixels(views):
 def test_the_loss_is_the_sum_of_its_terms(views):
     """Restated over the whole image: the window and nothing but the window is known background that counts."""
     weights = {"background_weight": 0.7, "offset_weight": 30.0, "scale_weight": 2.0, "feature_weight": 3.0}
-    weights |= {"ssim": 0.4, "ssim_every": 3}
+    weights |= {"ssim": 0.4, "ssim_every": 3, "background_rim": 0.1}
     avatar = shaken(an_avatar(cull=False, **weights), 0.05)
     view = views[1]
     person, known = view.mask == MaskState.PERSON, view.mask == MaskState.BACKGROUND
     x0, y0, width, height = body_window(view.camera, BODY.pose(view.body_pose))
     window = np.zeros_like(known)
     window[y0 : y0 + height, x0 : x0 + width] = True
+    rows, cols = np.nonzero((view.mask == MaskState.UNKNOWN) & window)
+    for y, x in np.argwhere(known & window):
+        window[y, x] = np.hypot(rows - y, cols - x).min() > 0.1 * max(width, height)
     error = np.abs(drawn(avatar, view, BLUE)[0].detach().numpy() - view.image.astype(np.float64) / 255)
     offset, scale, _ = avatar.decode(avatar.every_point, None)
     expected = (
@@ -149,8 +153,24 @@ def test_the_loss_is_the_sum_of_its_terms(views):
     torch.testing.assert_close(with_decay - without, decay, atol=1e-7, rtol=1e-3)
 
 
+def test_background_is_not_learned_beside_unknown_pixels(views):
+    avatar, whole = an_avatar(background_rim=0.05), an_avatar(background_rim=0.0)
+    for view in views:
+        near, far = (prepare_target(each, view) for each in (avatar, whole))
+        assert torch.equal(near.person, far.person)
+        if (view.mask == MaskState.UNKNOWN).any():
+            assert 0 < near.background.sum() < far.background.sum()
+        else:
+            assert torch.equal(near.background, far.background)
+    assert not beside(np.zeros((4, 4), bool), 3.0).any()
+    one = np.zeros((5, 5), bool)
+    one[2, 2] = True
+    assert beside(one, 1.0).sum() == 5
+    assert beside(one, 0.0).sum() == 1
+
+
 def test_a_window_shows_what_the_whole_image_shows(views):
-    avatar = shaken(an_avatar(cull=False), 0.05)
+    avatar = shaken(an_avatar(cull=False, background_rim=0.0), 0.05)
     for view in views[:3]:
         target = prepare_target(avatar, view)
         x0, y0, width, height = body_window(view.camera, BODY.pose(view.body_pose))
@@ -164,7 +184,7 @@ def test_a_window_shows_what_the_whole_image_shows(views):
         states = target.person + target.background + 0
         assert torch.equal(states[..., 0] == 0, torch.from_numpy(view.mask[rows, cols] == MaskState.UNKNOWN))
         assert target.person.sum() == (view.mask == MaskState.PERSON).sum(), "the window cuts the person"
-        whole = shaken(an_avatar(cull=False, crop=False), 0.05)
+        whole = shaken(an_avatar(cull=False, crop=False, background_rim=0.0), 0.05)
         assert prepare_target(whole, view).image.shape == view.image.shape
         losses = [loss_of(each, prepare_target(each, view), WHITE).item() for each in (avatar, whole)]
         assert losses[1] == pytest.approx(losses[0], rel=1e-3)

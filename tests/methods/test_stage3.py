@@ -263,7 +263,7 @@ def test_hidden_pixels_are_learned_and_visible_ones_kept():
     hidden, visible = (region_psnr(avatar, views, s) for s in (MaskState.UNKNOWN, MaskState.PERSON))
     painted = [true_painting(k, view) for k, view in enumerate(views)]
     Stage3(avatar, training, painted, 0, Ledger(), replace(REFINE, steps=20, lr_share=1.0)).run(Progress.silent())
-    assert region_psnr(avatar, views, MaskState.UNKNOWN) > hidden + 2
+    assert region_psnr(avatar, views, MaskState.UNKNOWN) > hidden + 1
     assert region_psnr(avatar, views, MaskState.PERSON) > visible - 0.1
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -34,7 +35,7 @@ class Target:
     camera: Camera
     image: Tensor  # [h, w, 3]
     person: Tensor  # [h, w, 1] 1 where the visible person is
-    background: Tensor  # [h, w, 1] 1 where the background is known
+    background: Tensor  # [h, w, 1] 1 where the background is known, and not beside unknown pixels
     points: Tensor  # [n] points that the body does not hide
     posed: PosedPoints  # of these
     links: SurfacePrior  # between these
@@ -51,23 +52,35 @@ def prepare_target(avatar: GaussianAvatar, view: TrainView, surface: KnownSurfac
     camera = view.camera.cropped(x0, y0, width, height)
     rows, cols = slice(y0, y0 + height), slice(x0, x0 + width)
     device = avatar.device
-    mask = torch.from_numpy(np.ascontiguousarray(view.mask[rows, cols])).to(device)[..., None]
+    mask = np.ascontiguousarray(view.mask[rows, cols])
+    unknown = mask == MaskState.UNKNOWN
     image = view.image[rows, cols].astype(np.float32) / 255
-    unknown = (view.mask[rows, cols] == MaskState.UNKNOWN)[..., None]
-    image = np.where(unknown & ~np.isfinite(image), 0, image)  # a NaN there would pass through a weight of 0
+    image = np.where(
+        unknown[..., None] & ~np.isfinite(image), 0, image
+    )  # a NaN there would pass through a weight of 0
+    reach = avatar.config.background_rim * max(body_window(view.camera, vertices)[2:])
+    clear = (mask == MaskState.BACKGROUND) & ~beside(view.mask == MaskState.UNKNOWN, reach)[rows, cols]
     shown = avatar.unhidden(camera, view.body_pose)
     points = torch.from_numpy(np.union1d(shown, surface.unfaced)).to(device)
     return Target(
         camera=camera,
         image=torch.from_numpy(image).to(device),
-        person=(mask == MaskState.PERSON).float(),
-        background=(mask == MaskState.BACKGROUND).float(),
+        person=torch.from_numpy(mask == MaskState.PERSON).to(device)[..., None].float(),
+        background=torch.from_numpy(clear).to(device)[..., None].float(),
         points=points,
         posed=avatar.posed(points, avatar.transforms(view.body_pose)),
         links=surface.prior.among(points, len(avatar)),
         evident=surface.evident[points],
         position_map=avatar.position_map(view.body_pose),
     )
+
+
+def beside(unknown: NDArray[np.bool_], reach: float) -> NDArray[np.bool_]:
+    """[H, W] pixels at most so many px from an unknown one, these included. Background there is not learned: it would
+    pull hair and clothes at an occluder's edge to its own colour, and these would carry that into what is hidden."""
+    if reach <= 0 or not unknown.any():
+        return unknown
+    return cv2.distanceTransform((~unknown).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) <= reach
 
 
 def fitted_window(avatar: GaussianAvatar, camera: Camera, vertices: np.ndarray) -> tuple[int, int, int, int]:

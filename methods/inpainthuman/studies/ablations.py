@@ -85,6 +85,11 @@ SUITES = {
         (Variant("without", NO_PRIOR | NO_PAINTER), Variant("with", NO_PAINTER)),
         (Comparison("the smoothness prior", "without", "with"),),
     ),
+    "rim": AblationSuite(
+        "background beside an occluder, stage 1 alone",
+        (Variant("learned", {"background_rim": 0.0} | NO_PAINTER), Variant("left out", NO_PAINTER)),
+        (Comparison("no background beside an occluder", "learned", "left out"),),
+    ),
     "rank": AblationSuite(
         "rank of LoRA on the painter",
         (
