@@ -23,6 +23,7 @@ PERSON = "a photo of a person"
 TRAIT_TOKENS = 4
 USUAL_WIDTH = 0.75  # of a crop, as a share of its height
 STRIPS = (0.7, 0.15, 0.15, 0.0, 0.0, 0.0)  # kinds of occluders of the other photographs
+NOISY = 0.6  # share of the schedule, above which a dropped context is noised
 LEFT = 0.15  # of the crop's sides, that a dropped context leaves at most
 NOT_IN_HIDDEN = 0.35  # share of the crops whose hidden surface no other photograph shows
 
@@ -111,9 +112,11 @@ class Batches(Dataset[MiniBatch]):
         seen[dropped] = 0  # or it would say who it is
         use_parts = bool(rng.random() < config.control)
         prompts, captioned = self.words(rng, rows[:, 2])
+        # less noise would say who it is: of a dropped context the words alone are to
+        lowest = np.where(dropped, round(NOISY * self.timesteps), 0)
         return MiniBatch(
             *(torch.from_numpy(array) for array in (images, seen, person, hidden, labels)),
-            timesteps=torch.from_numpy(rng.integers(0, self.timesteps, len(rows))),
+            timesteps=torch.from_numpy(rng.integers(lowest, self.timesteps)),
             traits=torch.from_numpy(self.crops.traits[rows[:, 2]]),
             people=torch.from_numpy(rows[:, 2]),
             told=torch.tensor(captioned),
