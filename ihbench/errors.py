@@ -29,7 +29,8 @@ class MissingPrerequisite(BadInput, RuntimeError, ImportError):
 
 
 class Diverged(Exception):
-    """A fit stopped because its loss or its parameters stopped being finite. A recorded outcome, not a crash.
+    """A fit stopped because its loss or its parameters stopped being finite, or because nothing was left of the
+    avatar. A recorded outcome, not a crash.
 
     `step` is the first bad step, `reason` says what was seen there.
     """
