@@ -345,6 +345,38 @@ def test_spared_ones_are_not_merged_and_what_may_not_grow_does_not():
     assert (event.split, event.merged, event.count) == (0, 0, 3)
 
 
+def test_a_method_of_two_phases_with_vertices_put_back():
+    """GTU: vertices that would go are put back, faint; after growth has ended only pruning goes on."""
+    start = 0.02
+    adam = adam_of([start, start, start])
+    control = control_of(adam, rules=DensityRules(spared=lambda gaussians: gaussians.carried("original")))
+    assert control.after_step(EVENT).count == 3 + 2 * 3
+    back = control.kept_back
+    assert back.tolist() == [True] * 3 + [False] * 6
+    adam.set_rows("log_scales", back, math.log(start))
+    adam.set_rows("opacity_logits", back, to_logit(torch.tensor(0.01)))
+    with torch.no_grad():
+        adam.gaussians.log_scales[-1] = 0.0  # a metre
+    control.config = with_(clone="off", split=False, largest=0.5, faint=0.005)
+    control.observe(EVENT + 1, torch.ones(9, 2), torch.ones(9), 64, 64)
+    event = control.after_step(2 * EVENT)
+    assert (event.split, event.pruned, event.count) == (0, 1, 8)
+    assert parents(adam) == [0, 1, 2, 0, 1, 2, 0, 1]
+
+
+def test_a_fit_rolls_back_across_a_change():
+    control = a_fit()
+    fit(control, 1, 9)
+    good = {name: value.clone() for name, value in control.tensors().items()}
+    fit(control, 9, 25)
+    ahead = {name: value.clone() for name, value in control.tensors().items()}
+    assert len(ahead["density.radius"]) != len(good["density.radius"])
+    control.put(good)
+    fit(control, 9, 25)
+    for name, value in ahead.items():
+        assert torch.equal(control.tensors()[name], value), name
+
+
 def test_resets_come_at_their_steps():
     """GauHuman on white: once, at 400, which is no event of density."""
     adam = adam_of([0.005] * 2)
