@@ -447,6 +447,15 @@ def test_the_same_seed_gives_the_same_and_global_generators_do_not_matter():
     assert not torch.equal(one.adam.gaussians.means, other.adam.gaussians.means)
 
 
+def test_places_differ_by_step_and_by_operation():
+    adams = [adam_of([0.005]), adam_of([0.005]), adam_of([0.02])]
+    control_of(adams[0]).after_step(EVENT)
+    control_of(adams[1]).after_step(2 * EVENT)
+    control_of(adams[2]).after_step(EVENT)
+    drawn = [(adam.gaussians.means[-1] / scale).tolist() for adam, scale in zip(adams, (1, 1, 4), strict=True)]
+    assert len({tuple(each) for each in drawn}) == 3
+
+
 @pytest.mark.parametrize("stop", [9, 10, 23, 30, 36])
 def test_a_stopped_fit_goes_on_to_the_bit(tmp_path, stop):
     whole = a_fit()
