@@ -325,6 +325,11 @@ class Ledger:
         if self.on_event is not None:
             self.on_event(self.events[-1])
 
+    def event_once(self, happening: Happening) -> None:
+        """As `event`, unless the record has it: a resumed run comes by the same places again."""
+        if not any(event.kind == happening.kind and event.data == vars(happening) for event in self.events):
+            self.event(happening)
+
     @property
     def on_disk(self) -> bool:
         """Whether what is saved outlives the process."""

@@ -52,8 +52,8 @@ class _Good:
 
 
 class Optimisation(ABC, Generic[Module]):
-    """One view a step. A stage gives its loss (`_loss`), and may act before each step (`_before_step`) and after a
-    saved state has been restored (`_restored`).
+    """One view a step. A stage gives its loss (`_loss`), may have a schedule of its own (`_rate_share`), and may act
+    before each step (`_before_step`) and after a saved state has been restored (`_restored`).
 
     Parameters of the avatar in none of the `groups` are frozen meanwhile. Step sizes rise over the share `warm_up` of
     the steps and fall to the share `lr_final` as half a cosine; each group's gradient is clipped to the norm
@@ -98,6 +98,12 @@ class Optimisation(ABC, Generic[Module]):
     @abstractmethod
     def _loss(self, k: int) -> Tensor:
         """The loss of view k. Must be differentiable in the avatar's parameters."""
+
+    def _rate_share(self) -> float:
+        """Of the groups' step sizes, what the step after `self.step` takes."""
+        rise = min((self.step + 1) / max(self.warm_up * self.steps, 1), 1)
+        decay = self.lr_final + (1 - self.lr_final) * 0.5 * (1 + math.cos(math.pi * self.step / self.steps))
+        return decay * rise
 
     def _before_step(self) -> None:
         """Called before each step; `self.step` are done."""
@@ -161,11 +167,9 @@ class Optimisation(ABC, Generic[Module]):
 
     def _one_step(self, k: int) -> None:
         self._before_step()
-        share = self.step / self.steps
-        rise = min((self.step + 1) / max(self.warm_up * self.steps, 1), 1)
-        decay = self.lr_final + (1 - self.lr_final) * 0.5 * (1 + math.cos(math.pi * share))
+        share = self._rate_share()
         for group, rate in zip(self.optimizer.param_groups, self.rates, strict=True):
-            group["lr"] = rate * decay * rise * SMALLER**self.rolled_back
+            group["lr"] = rate * share * SMALLER**self.rolled_back
         self.optimizer.zero_grad(set_to_none=True)
         loss = self._loss(k)
         self._check_loss(k, loss.item())
@@ -243,8 +247,8 @@ class Optimisation(ABC, Generic[Module]):
     # --- resume ---
 
     def _tensors(self) -> dict[str, Tensor]:
-        """Parameters and optimiser moments by name; not copies."""
-        tensors = {f"avatar.{name}": p.detach() for name, p in self.avatar.named_parameters()}
+        """Parameters, persistent buffers and optimiser moments by name; not copies."""
+        tensors = {f"avatar.{name}": value.detach() for name, value in self.avatar.state_dict().items()}
         for p, state in self.optimizer.state.items():
             for key, value in state.items():
                 tensors[f"adam.{self.names[id(p)]}.{key}"] = value
@@ -252,10 +256,11 @@ class Optimisation(ABC, Generic[Module]):
 
     @torch.no_grad()
     def _put(self, tensors: Tensors) -> None:
-        """Set parameters and moments to copies of these."""
+        """Set parameters, persistent buffers and moments to copies of these."""
         self.optimizer.state.clear()
+        for name, value in self.avatar.state_dict().items():
+            value.copy_(torch.as_tensor(tensors[f"avatar.{name}"]))
         for name, p in self.avatar.named_parameters():
-            p.copy_(torch.as_tensor(tensors[f"avatar.{name}"]))
             state = {
                 key: torch.as_tensor(tensors[f"adam.{name}.{key}"]).to(p.device, copy=True)
                 for key in ("step", "exp_avg", "exp_avg_sq")

@@ -97,16 +97,10 @@ class Stage3(Optimisation[GaussianAvatar]):
         if self.config.steps > 0:
             perceptual = load_perceptual(self.config, self.avatar.device)
             if isinstance(perceptual, str):
-                self._say_once("lpips term", perceptual)
+                self.ledger.event_once(LeftOut("lpips term", perceptual))
             else:
                 self._perceptual = perceptual
         super().run(progress)
-
-    def _say_once(self, what: str, reason: str) -> None:
-        """A resumed run has the event already."""
-        said = [event.data["what"] for event in self.ledger.events if event.kind == LeftOut.kind]
-        if what not in said:
-            self.ledger.event(LeftOut(what, reason))
 
     def _loss(self, k: int) -> Tensor:
         target, background = self._targets[k], self.training.background
