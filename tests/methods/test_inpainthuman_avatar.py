@@ -14,7 +14,8 @@ from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput
-from ihbench.methods.inpainthuman.avatar.avatar import DECODED_KEPT, GaussianAvatar
+from ihbench.fit.decoded_cache import DECODED_KEPT
+from ihbench.methods.inpainthuman.avatar.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.avatar.decoder import GaussianDecoder, positional_encoding, scale_factor
 from ihbench.methods.inpainthuman.config import QUICK
 from ihbench.methods.inpainthuman.method import InpaintHuman

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -17,7 +17,8 @@ from ihbench.body.pose import BodyPose
 from ihbench.body.uv import chart_padding, texel_table
 from ihbench.camera import Camera
 from ihbench.config_fields import read
-from ihbench.errors import BadInput
+from ihbench.fit.avatar_files import read_avatar, write_avatar
+from ihbench.fit.decoded_cache import DecodedCache
 from ihbench.fit.precision import autocast
 from ihbench.methods.inpainthuman.avatar.decoder import GaussianDecoder, positional_encoding, scale_factor
 from ihbench.methods.inpainthuman.avatar.pose_residual import ResidualEncoder, root_free_position_map
@@ -28,7 +29,6 @@ from ihbench.render.splat import render_gaussians
 from ihbench.render.triangles import triangle_areas, triangle_crosses
 from ihbench.render.zbuffer import rasterize
 
-DECODED_KEPT = 16  # poses, 1.5 MB each in the quick profile
 CULL_SLACK = 0.04  # m behind the nearest body surface; garments and offsets stay well within it
 CULL_BACK_SLACK = 0.012  # m, for points whose normal is turned well away: the far side of an arm, not of a finger
 CULL_FACING = -0.3  # cosine below which a normal is turned well away, beyond the silhouette's rim
@@ -69,8 +69,7 @@ class GaussianAvatar(nn.Module):
         self.config, self.body, self.betas = config, body, np.asarray(betas, np.float64)
         self.residual_on = False
         self.fit_dtype = torch.float32  # of the networks while they learn
-        self._kept: dict[bytes, tuple[Tensor, Tensor, Tensor]] = {}  # decoded, by pose
-        self._decoded_from: list[tuple[int, float]] = []  # these parameters: versions and sums
+        self._decoded_cache: DecodedCache[tuple[Tensor, Tensor, Tensor]] = DecodedCache()  # by pose
         generator = torch.Generator().manual_seed(seed)
         texels = texel_table(body, config.texels)
         self.texels = texels
@@ -209,18 +208,12 @@ class GaussianAvatar(nn.Module):
 
     def _decoded(self, body_pose: BodyPose) -> tuple[Tensor, Tensor, Tensor]:
         """`decode` of every point, kept for the next camera: it depends on the pose of the joints at most."""
-        # fused optimisers change parameters without counting a version, so their sums are looked at, too
-        state = [(p._version, float(p.detach().sum())) for p in self.parameters()]
-        if state != self._decoded_from:
-            self._kept.clear()
-            self._decoded_from = state
         key = body_pose.pose[1:].tobytes() + body_pose.betas.tobytes() if self.residual_on else b""
-        if key not in self._kept:
-            if len(self._kept) >= DECODED_KEPT:
-                self._kept.pop(next(iter(self._kept)))
-            position_map = self.position_map(body_pose) if self.residual_on else None
-            self._kept[key] = self.decode(self.every_point, position_map)
-        return self._kept[key]
+
+        def decode() -> tuple[Tensor, Tensor, Tensor]:
+            return self.decode(self.every_point, self.position_map(body_pose) if self.residual_on else None)
+
+        return self._decoded_cache.get(self, key, decode)
 
     def render(
         self,
@@ -243,53 +236,19 @@ class GaussianAvatar(nn.Module):
 
         Raises `BadInput` when the disk does not take it.
         """
-        from safetensors.torch import save
-
-        from ihbench.files.atomic import write_bytes, write_json
-
-        state = {k: v.detach().cpu().contiguous() for k, v in self.state_dict().items()}
-        write_bytes(folder / "avatar.safetensors", save(state))
-        write_json(
-            folder / "avatar.json",
-            {
-                "kind": "inpainthuman",
-                "config": asdict(self.config),
-                "betas": self.betas.tolist(),
-                "body": self.body.content_sha(),
-                "residual_on": self.residual_on,
-            },
-        )
+        more = {"residual_on": self.residual_on}
+        write_avatar(folder, "inpainthuman", self, self.config, self.body, self.betas, **more)
 
     @classmethod
     def load(cls, folder: Path, body: Body, device: str = "cpu") -> GaussianAvatar:
         """Read what `save` wrote. Raises `BadInput` for a missing or foreign file or another body."""
-        from safetensors import SafetensorError
-        from safetensors.torch import load
-
-        from ihbench.files.atomic import read_json
-        from ihbench.files.regular import read_bytes
-
-        try:
-            words = read_json(folder / "avatar.json")
-            tensors = load(read_bytes(folder / "avatar.safetensors"))
-        except (BadInput, ValueError, KeyError, SafetensorError) as error:
-            raise BadInput(f"{folder}: no readable avatar there: {error}") from error
-        kind = words.get("kind") if isinstance(words, dict) else None
-        if kind != "inpainthuman":
-            raise BadInput(f"{folder}: holds an avatar of kind {kind!r}, expected 'inpainthuman'")
-        fitted, given = words.get("body"), body.content_sha()
-        if fitted != given:
-            raise BadInput(f"{folder}: was fitted on another body ({fitted}) than the one given ({given})")
-        try:
+        saved = read_avatar(folder, "inpainthuman", body)
+        words = saved.words
+        with saved.put_together():
             config = read(InpaintHumanConfig, words["config"], "avatar.json: config")
             avatar = cls(config, body, np.array(words["betas"]), seed=0)
-            avatar.load_state_dict(tensors)
+            avatar.load_state_dict(saved.tensors)
             avatar.residual_on = bool(words["residual_on"])
-        except (BadInput, AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise BadInput(
-                f"{folder}: avatar.json and avatar.safetensors do not belong together or to this version "
-                f"({type(error).__name__}: {str(error).splitlines()[0]}); fit again"
-            ) from error
         return avatar.to(device)
 
 
