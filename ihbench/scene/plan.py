@@ -24,6 +24,8 @@ from ihbench.scene.spread import spread
 from ihbench.scene.views import OccludedScene
 from ihbench.scene.visibility import texel_visibility
 
+POINTS_A_PIXEL = 2.0  # along a side; more Gaussians than that draw the same picture
+LEAST_TEXELS = 64
 MEASURE_SIZE = 256  # px; visibility is measured on images reduced to about this
 MEASURE_VIEWS = 50  # at most this many training views, evenly spaced
 TEXELS = 128  # side of the UV grid on which visibility is measured
@@ -109,6 +111,13 @@ def measure_scene(scene: OccludedScene) -> SceneMeasure:
         occlusion={"rule": hiding.occlusion.rule, **hiding.occlusion.record},
         in_scene=hiding.in_scene,
     )
+
+
+def useful_texels(scene: SceneMeasure, texels: int) -> int:
+    """The side of the coarsest UV grid, halved from `texels`, whose Gaussians stand close enough for the pixels."""
+    while texels > LEAST_TEXELS and scene.texel_mm(texels // 2) * POINTS_A_PIXEL <= scene.pixel_mm:
+        texels //= 2
+    return texels
 
 
 def absent_regions(measure: SceneMeasure, regions: tuple[str, ...]) -> list[Omission]:

@@ -17,7 +17,7 @@ from ihbench.fit.precision_name import Precision
 from ihbench.fit.prior_config import PriorConfig
 from ihbench.methods.inpainthuman.refine_config import PAPER_REFINE, QUICK_REFINE, RefineConfig
 from ihbench.metrics.weights import FILES, locate
-from ihbench.scene.plan import Omission, SceneMeasure
+from ihbench.scene.plan import Omission, SceneMeasure, useful_texels
 
 WEIGHT, RATE = Within(0, 1e6), Within(0, 1000)  # of a term of the loss; a step size
 STATIC_DEG = 5.0  # below this joint motion nothing depends on the pose
@@ -25,8 +25,6 @@ NOTHING_HIDDEN = 0.002  # share of the texels that no frame shows although one f
 PART_TURN = 0.05  # share of the texels that never face the camera, above which the person turns only in part
 GLANCING = 0.5  # cosine; a person who turns in part shows what lies beside the unseen side at less than this
 FINEST_LEVEL = 3.0  # a level whose texels are this many times finer than the pixels cannot be told apart by them
-POINTS_A_PIXEL = 2.0  # along a side; more Gaussians than that draw the same picture
-LEAST_TEXELS = 64
 ONE_FIT_STEPS = 1.175  # of stage 1's: with these, one fit is as good as stages 1 and 3 with half as many steps more
 ONE_FIT_SSIM = 0.2  # weight; stage 3's (sec. 3.4)
 
@@ -171,9 +169,7 @@ def leave_out(config: InpaintHumanConfig, scene: SceneMeasure) -> list[Omission]
             f"{scene.texel_mm(max(config.levels)):.1f} mm"
         )
         out.append(Omission("levels", useful, reason, _both_fits(LEVEL_SHARE * (len(config.levels) - len(useful)))))
-    texels = config.texels
-    while texels > LEAST_TEXELS and scene.texel_mm(texels // 2) * POINTS_A_PIXEL <= scene.pixel_mm:
-        texels //= 2
+    texels = useful_texels(scene, config.texels)
     if texels != config.texels:
         reason = (
             f"a pixel covers {scene.pixel_mm:.1f} mm of the body; {config.texels}² Gaussians stand "

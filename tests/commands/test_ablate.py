@@ -20,7 +20,7 @@ from ihbench.commands.ablate import AblateOptions
 from ihbench.config_fields import flat
 from ihbench.errors import BadInput
 from ihbench.files.atomic import read_json
-from ihbench.methods.inpainthuman.config import LEAST_TEXELS, PROFILES, QUICK
+from ihbench.methods.inpainthuman.config import PROFILES, QUICK
 from ihbench.methods.inpainthuman.method import InpaintHuman
 from ihbench.methods.inpainthuman.spec import SPEC, STAGE1
 from ihbench.methods.inpainthuman.studies.ablations import SUITES
@@ -43,7 +43,7 @@ from ihbench.runner.executor import Cell, run_cells
 from ihbench.runner.run_loop import RunRequest, _planned
 from ihbench.runner.shared_states import reusable_run, reuse_state
 from ihbench.scene.data_source import DataSource
-from ihbench.scene.plan import SceneMeasure
+from ihbench.scene.plan import LEAST_TEXELS, SceneMeasure
 from ihbench.scene.protocol import load_protocol
 from tests.conftest import SCENES
 from tests.reports.fake_runs import about, identity, record

@@ -13,7 +13,6 @@ from ihbench.body.pose import BodyPose
 from ihbench.config_fields import as_json, flat, with_fields
 from ihbench.methods.inpainthuman import config as method_config
 from ihbench.methods.inpainthuman.config import (
-    LEAST_TEXELS,
     ONE_FIT_SHARE,
     PAPER,
     QUICK,
@@ -23,6 +22,7 @@ from ihbench.methods.inpainthuman.config import (
 from ihbench.record.finished_run import earlier_runs
 from ihbench.scene import plan
 from ihbench.scene.plan import (
+    LEAST_TEXELS,
     TEXELS,
     Omission,
     SceneMeasure,
