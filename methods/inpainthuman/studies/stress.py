@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,10 +25,19 @@ from ihbench.methods.inpainthuman.method import InpaintHuman
 from ihbench.methods.inpainthuman.stages.stage1 import Stage1, loss_of, prepare_target
 from ihbench.scene.contracts import MaskState, TrainingSet, TrainView
 from ihbench.stress.case import Answer, Case, Unit, words_of
-from ihbench.stress.drawn_capture import WHITE, a_camera, a_pose, the_body, train_view
+from ihbench.stress.drawn_capture import WHITE, the_body
+from ihbench.stress.six_views import (
+    SIZE,
+    all_unknown,
+    only_a_pixel,
+    training_set,
+    views,
+    with_bad_hidden_pixels,
+    with_bad_pixel,
+    with_view,
+)
 from ihbench.stress.training import story_of_fit
 
-SIZE = 48  # px
 STEPS = 16
 RATES = ("lr_maps", "lr_decoder", "lr_encoder")
 # step sizes and a first scale at which 16 steps show something; at this size the rim is half of the person
@@ -43,30 +52,6 @@ HELPS = "the loss over the views after the fit, over the loss before: a fit that
 STEP = "a step is counted"
 REFUSED = "it must be refused, and the line must say this"
 EXACT = "not a bit may change"
-
-
-@cache
-def views() -> tuple[TrainView, ...]:
-    """Six sides of a person who bends; every other view has a strip."""
-    return tuple(
-        train_view(
-            a_camera(0.0, SIZE), a_pose(1.05 * k, 0.3 * math.sin(k)), slice(21, 27) if k % 2 else None, frame=k
-        )
-        for k in range(6)
-    )
-
-
-def training_set(shown: Sequence[TrainView] | None = None) -> TrainingSet:
-    return TrainingSet(list(views() if shown is None else shown), the_body(), WHITE, "stress")
-
-
-def with_view(k: int, **changes: Any) -> TrainingSet:
-    return training_set([replace(view, **changes) if j == k else view for j, view in enumerate(views())])
-
-
-def a_person_pixel(k: int) -> tuple[int, ...]:
-    """Row and column of one, in view k."""
-    return tuple(np.argwhere(views()[k].mask == MaskState.PERSON)[9])
 
 
 def mean_loss(avatar: GaussianAvatar, training: TrainingSet) -> float:
@@ -195,13 +180,6 @@ def _contradiction() -> Answer:
     return _ratio(TINY, training_set([*views(), *(replace(view, mask=states[view.mask]) for view in views())]))
 
 
-def only_a_pixel(k: int, elsewhere: MaskState) -> TrainView:
-    """View k with one person pixel."""
-    mask = np.full_like(views()[k].mask, elsewhere)
-    mask[a_person_pixel(k)] = MaskState.PERSON
-    return replace(views()[k], mask=mask)
-
-
 def _speck() -> Answer:
     """Such a view costs a hundred times what others do; the guard must not take it for an explosion."""
     _, story = fitted(TINY, training_set([*views()[:4], only_a_pixel(1, MaskState.BACKGROUND)]))
@@ -224,9 +202,7 @@ def _behind() -> Answer:
 
 def _bad_pixel(bad: float) -> Answer:
     """One pixel of one view is not finite. Its first step is known; smaller steps cannot help, so none is tried."""
-    image = views()[2].image.astype(np.float32)
-    image[a_person_pixel(2)] = bad
-    training = with_view(2, image=image)
+    training = with_bad_pixel(2, bad)
     stage = Stage1(fresh(TINY), training, 0, Ledger())
     first = next(step for step in range(6) if stage._view_of(step, 6) == 2)
     after, story = fitted(TINY, training)
@@ -236,9 +212,7 @@ def _bad_pixel(bad: float) -> Answer:
 
 def _hidden_bad_pixel() -> Answer:
     """A NaN behind the occluder is nobody's business: 0 × NaN must not enter the loss."""
-    image = views()[1].image.astype(np.float32)
-    image[views()[1].mask == MaskState.UNKNOWN] = math.nan
-    return _ratio(TINY, with_view(1, image=image))
+    return _ratio(TINY, with_bad_hidden_pixels(1, math.nan))
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -399,7 +373,7 @@ CASES = [
     _step("speck", "a view of one person pixel on known background", _speck),
     _refused("no-view", "no training view", partial(_nothing, [])),
     _refused("all-hidden", "views without a visible pixel",
-             lambda: _nothing([replace(v, mask=np.full_like(v.mask, MaskState.UNKNOWN)) for v in views()])),
+             lambda: _nothing(all_unknown())),
     _helps("behind-camera", "a view with the body behind the camera", _behind),
     _step("nan-pixel", "a NaN among the person's pixels", partial(_bad_pixel, math.nan)),
     _step("inf-pixel", "an infinite person pixel", partial(_bad_pixel, math.inf)),
