@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -26,9 +26,30 @@ class Gaussians:
     """A scene for the splat renderer."""
 
     means: Tensor  # [N, 3] m
-    scales: Tensor  # [N] m
-    colors: Tensor  # [N, 3]
+    scales: Tensor  # [N] or [N, 3] m, or covariances [N, 3, 3] m²
+    colors: Tensor  # [N, 3], or spherical harmonics [N, K, 3]
     camera: Camera
+    quaternions: Tensor | None = None  # [N, 4]
+    opacities: Tensor | None = None  # [N]
+    sh_degree: int | None = None
+    preset: Literal["opaque", "3dgs"] = "opaque"
+
+    def tensors(self) -> dict[str, Tensor]:
+        """What is given, by name."""
+        names = ("means", "scales", "colors", "quaternions", "opacities")
+        return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+
+    def draw(
+        self, leaves: dict[str, Tensor], backend: str, background: Sequence[float] = (1.0, 1.0, 1.0)
+    ) -> tuple[Tensor, Tensor]:
+        """The picture and its alpha, with tensors of these names instead of its own."""
+        from ihbench.render.splat import render_gaussians
+
+        first, options = dict(list(leaves.items())[:3]), dict(list(leaves.items())[3:])
+        return render_gaussians(
+            **first, camera=self.camera, background=background, backend=backend, **options, sh_degree=self.sh_degree,
+            preset=self.preset,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -100,29 +121,36 @@ def compare_with_twin(
     """
     import torch
 
-    from ihbench.render.splat import project_gaussians, render_gaussians
+    from ihbench.render.splat import project_gaussians
     from ihbench.render.splat_reference import alphas_near_threshold
-    from ihbench.render.splats import ALPHA_MIN
+    from ihbench.render.splats import ALPHA_MIN, PRESETS
 
-    inputs = (scene.means, scene.scales, scene.colors)
-    camera = scene.camera
-    near = alphas_near_threshold(project_gaussians(*inputs, camera), camera.height, camera.width, tolerance)
+    inputs, camera = scene.tensors(), scene.camera
+    # colours do not move a threshold; spherical harmonics would have to be evaluated
+    plain = scene.colors.flatten(1)[:, :1]
+    splats = project_gaussians(
+        scene.means, scene.scales, plain, camera, quaternions=scene.quaternions, opacities=scene.opacities,
+        preset=scene.preset,
+    )  # fmt: skip
+    near = alphas_near_threshold(splats, camera.height, camera.width, tolerance, PRESETS[scene.preset])
     generator = torch.Generator(device="cpu").manual_seed(seed)
-    pull_rgb = torch.randn(*near.shape, scene.colors.shape[1], generator=generator, dtype=torch.float64)
+    pull_rgb = torch.randn(*near.shape, scene.colors.shape[-1], generator=generator, dtype=torch.float64)
     pull_alpha = torch.randn(*near.shape, generator=generator, dtype=torch.float64)
     device = scene.means.device
     pull_rgb, pull_alpha = (pull_rgb.to(device) * (near == 0)[..., None], pull_alpha.to(device) * (near == 0))
 
     def draw(which: str, dtype: torch.dtype) -> tuple[Tensor, list[Tensor]]:
-        leaves = [x.detach().to(dtype).requires_grad_() for x in inputs]
-        rgb, alpha = render_gaussians(leaves[0], leaves[1], leaves[2], camera, background, which)
-        gradients = torch.autograd.grad([rgb, alpha], leaves, [pull_rgb.to(dtype), pull_alpha.to(dtype)])
+        leaves = {name: x.detach().to(dtype).requires_grad_() for name, x in inputs.items()}
+        rgb, alpha = scene.draw(leaves, which, background)
+        gradients = torch.autograd.grad(
+            [rgb, alpha], list(leaves.values()), [pull_rgb.to(dtype), pull_alpha.to(dtype)]
+        )
         return torch.cat([rgb, alpha[..., None]], -1).detach().double(), [g.double() for g in gradients]
 
     image, gradients = draw(backend, scene.means.dtype)
     true_image, true_gradients = draw("reference", torch.float64)
     error = (image - true_image).abs().amax(-1)
-    names = ("means", "scales", "colors")
+    names = tuple(inputs)
     pairs = list(zip(gradients, true_gradients, strict=True))
     excess = (error - near * ALPHA_MIN)[near > 0]
     return SplatErrors(

@@ -1,23 +1,23 @@
 """The splat renderer on CUDA: the tile rasteriser of the `gsplat` package (1.4 and 1.5) under our own projection.
 
-Only its compositing is used, with the centres, the variances and the order of depth of `ihbench.render.splat`, so
+Only its compositing is used, with the centres, the covariances and the order of depth of `ihbench.render.splat`, so
 that the footprint is the one of the other back ends. What its kernel brings along are the largest and the smallest
 alpha. The largest was 0.999 up to 1.5.3 and is 0.99 in 1.6 (`MAX_ALPHA` in its `Common.h`, changed months before the
 version was): ten times as much shows through an opaque splat. A picture must not depend on which of them is
-installed, so a version of another largest alpha is refused, and both alphas are measured before the first picture,
+installed, so for the "opaque" preset a version of another largest alpha is refused; for "3dgs", whose largest is
+0.99, opacities are cut there before an older version sees them. Both alphas are measured before the first picture,
 whatever the version says.
 
-One difference remains and cannot be switched off: its kernel ends a pixel *before* the splat that would bring the
-transmittance to 1e-4 or less. Such a pixel shows up to 1e-4 / (1 - ALPHA_MAX) = 0.1 of the background. On a body-like
-scene of 5000 Gaussians, with that rule put into the twin, the largest error was 0.035 and the mean 6e-5. With gsplat
-1.5.3 on an H200 (`ihbench kernels splat`, 5000 to 200,000 Gaussians) the largest error in a window of 64² pixels was
-0.03 to 0.08, that of the gradient's norm 3 to 4 %; 200,000 Gaussians on 512² pixels took 2.4 ms forward and 1.3 ms
-backward, numba on one thread of that machine 71 and 103 ms.
+One difference from the "opaque" preset remains and cannot be switched off: its kernel ends a pixel *before* the splat
+that would bring the transmittance to 1e-4 or less. Such a pixel shows up to 1e-4 / (1 - ALPHA_MAX) = 0.1 of the
+background. On a body-like scene of 5000 Gaussians, with that rule put into the twin, the largest error was 0.035 and
+the mean 6e-5. With gsplat 1.5.3 on an H200 (`ihbench kernels splat`, 5000 to 200,000 Gaussians) the largest error in
+a window of 64² pixels was 0.03 to 0.08, that of the gradient's norm 3 to 4 %; 200,000 Gaussians on 512² pixels took
+2.4 ms forward and 1.3 ms backward.
 """
 
 from __future__ import annotations
 
-import math
 import re
 from typing import Any
 
@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from ihbench.errors import MissingPrerequisite
-from ihbench.render.splats import ALPHA_MAX, ALPHA_MIN, Splats
+from ihbench.render.splats import ALPHA_MAX, ALPHA_MIN, PRESETS, Ellipses, Preset, Splats, as_ellipses
 
 TILE = 16  # px
 _LARGEST_RADIUS = 2**30  # px; gsplat takes int32 radii
@@ -36,43 +36,54 @@ PROBE_STEP = 48  # px between the probe's splats, farther than any footprint and
 
 
 def composite(
-    splats: Splats,
+    splats: Splats | Ellipses,
     height: int,
     width: int,
     background: Tensor,  # [C]
+    preset: Preset | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Splats -> rgb [H, W, C], alpha [H, W], float32. `Splats` and the conventions: `ihbench.render.splat`.
+    """Splats -> rgb [H, W, C], alpha [H, W], float32. Conventions: `ihbench.render.splat`.
 
     Raises `MissingPrerequisite` without CUDA or without a gsplat that draws as this bench does.
     """
+    rules = preset or PRESETS["opaque"]
     gsplat = _gsplat(splats.xy.device)
-    check_alphas(gsplat, splats.xy.device)
-    return _composite(gsplat, splats, height, width, background)
+    check_alphas(gsplat, splats.xy.device, rules)
+    return _composite(gsplat, as_ellipses(splats), height, width, background, rules)
 
 
 def _composite(
-    gsplat: Any, splats: Splats, height: int, width: int, background: Tensor, opacities: Tensor | None = None
+    gsplat: Any,
+    splats: Ellipses,
+    height: int,
+    width: int,
+    background: Tensor,
+    rules: Preset,
+    opacities: Tensor | None = None,  # other ones than those that the lists of splats per tile are for
 ) -> tuple[Tensor, Tensor]:
     # gsplat batches over cameras: a leading dimension of one
-    xy, variance = splats.xy.float()[None], splats.variance.float()[None]
-    colors, depth = splats.colors.float()[None], splats.depth[None]
+    xy, colors, depth = splats.xy.float()[None], splats.colors.float()[None], splats.depth[None]
     background = background.float()
     if xy.shape[1] == 0:
         return background.expand(height, width, -1), xy.new_zeros(height, width)
 
-    inverse = 1 / variance
-    conics = torch.stack([inverse, torch.zeros_like(inverse), inverse], -1)  # xx, xy, yy of the inverse covariance
+    xx, both, yy = splats.covariance.unbind(1)
+    determinant = xx * yy - both * both
+    conics = torch.stack([yy, -both, xx], -1) / determinant[:, None]  # the inverse covariance
+    # a gsplat of a larger alpha never gets to use it: only the flat top of opacities above ours differs
+    opacities = splats.opacity if opacities is None else opacities
+    opacities = opacities.clamp(max=rules.alpha_max) if rules.alpha_max < ALPHA_MAX else opacities
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-    radii = _radii(xy.detach(), variance.detach(), height, width)
-    if _takes_two_radii(gsplat.__version__):
-        radii = radii[..., None].expand(-1, -1, 2).contiguous()
+    radii = _radii(splats, height, width, rules)
+    if not _takes_two_radii(gsplat.__version__):
+        radii = radii.amax(-1)
     _, pair_ids, splat_ids = gsplat.isect_tiles(xy.detach(), radii, depth, TILE, tiles_x, tiles_y)
     offsets = gsplat.isect_offset_encode(pair_ids, 1, tiles_x, tiles_y)
     rgb, alpha = gsplat.rasterize_to_pixels(
         xy,
-        conics,
+        conics.float()[None],
         colors,
-        torch.ones_like(variance) if opacities is None else opacities[None],
+        opacities.float()[None],
         width,
         height,
         TILE,
@@ -83,35 +94,46 @@ def _composite(
     return rgb[0], alpha[0, ..., 0]
 
 
-_measured: set[tuple[Any, str]] = set()  # packages and devices whose alphas are those of this bench
+_measured: set[tuple[Any, str, float]] = set()  # packages, devices and largest alphas that were seen to fit
 
 
-def check_alphas(gsplat: Any, device: torch.device) -> None:
-    """Raise `MissingPrerequisite` unless this gsplat draws with `ALPHA_MAX` and `ALPHA_MIN`: by its version, and by
-    three splats that it draws once a process."""
+def check_alphas(gsplat: Any, device: torch.device, preset: Preset | None = None) -> None:
+    """Raise `MissingPrerequisite` unless this gsplat can draw with a preset's alphas: by its version, and by three
+    splats that it draws once a process.
+
+    Its largest alpha must be the preset's. Where the preset's is smaller than that of an older gsplat, opacities are
+    cut at the preset's before drawing.
+    """
+    rules = preset or PRESETS["opaque"]
     version = str(gsplat.__version__)
     expected = largest_alpha(version)
-    if expected is not None and expected != ALPHA_MAX:
+    if expected is not None and expected < rules.alpha_max:
         raise MissingPrerequisite(_other_alpha(version, f"a largest alpha of {expected:g}"))
-    if (gsplat, str(device)) in _measured:
+    if (gsplat, str(device), rules.alpha_max) in _measured:
         return
     # pixel centres: alpha there is the opacity, between the two bounds
     opacities = torch.tensor([1.0, 1.05 * ALPHA_MIN, 0.95 * ALPHA_MIN], device=device)
     at = torch.arange(3, device=device, dtype=torch.float64) * PROBE_STEP + 0.5
-    splats = Splats(
+    variance = torch.full_like(at, 0.3)
+    splats = Ellipses(
         torch.stack([at, torch.full_like(at, 0.5)], 1),
-        torch.full_like(at, 0.3),
+        torch.stack([variance, torch.zeros_like(at), variance], 1),
+        torch.ones_like(opacities),
         torch.ones(3, device=device),
         torch.ones(3, 1, device=device),
     )
     with torch.no_grad():
         width = 2 * PROBE_STEP + 1
-        _, alpha = _composite(gsplat, splats, 1, width, torch.zeros(1, device=device), opacities)
+        # as opaque, whatever the preset: the package's own largest alpha is what shows
+        black = torch.zeros(1, device=device)
+        _, alpha = _composite(gsplat, splats, 1, width, black, PRESETS["opaque"], opacities)
     measured = alpha[0, ::PROBE_STEP].tolist()
-    for value, right in zip(measured, (ALPHA_MAX, 1.05 * ALPHA_MIN, 0.0), strict=True):
+    largest = expected or min((rules.alpha_max, ALPHA_MAX), key=lambda a: abs(a - measured[0]))
+    for value, right in zip(measured, (largest, 1.05 * ALPHA_MIN, 0.0), strict=True):
         if abs(value - right) > ALPHA_ERROR:
-            raise MissingPrerequisite(_other_alpha(version, f"an alpha of {value:.4g} where {right:.4g} belongs"))
-    _measured.add((gsplat, str(device)))
+            word = f"an alpha of {value:.4g} where {right:.4g} belongs"
+            raise MissingPrerequisite(_other_alpha(version, word))
+    _measured.add((gsplat, str(device), rules.alpha_max))
 
 
 def largest_alpha(version: str) -> float | None:
@@ -139,12 +161,16 @@ def _major_minor(version: str) -> tuple[int, int] | None:
     return None if parts is None else (int(parts[1]), int(parts[2]))
 
 
-def _radii(xy: Tensor, variance: Tensor, height: int, width: int) -> Tensor:
-    """[1, M] int32 px: where alpha falls under ALPHA_MIN, 0 for splats that do not reach the image."""
-    reach = torch.sqrt(variance * (2 * math.log(1 / ALPHA_MIN)))
-    far = torch.tensor([width, height], dtype=xy.dtype, device=xy.device)
-    outside = (xy - xy.clamp(torch.zeros_like(far), far)).abs().amax(-1)
-    return torch.where(outside <= reach, reach.ceil().clamp(max=_LARGEST_RADIUS), 0.0).int()
+def _radii(splats: Ellipses, height: int, width: int, rules: Preset) -> Tensor:
+    """[1, M, 2] int32 px: where alpha falls under `alpha_min`, 0 for splats that do not reach the image."""
+    with torch.no_grad():
+        xy = splats.xy.float()
+        cut = 2 * (splats.opacity.double() / rules.alpha_min).clamp(min=1).log()
+        reach = (splats.covariance[:, ::2] * cut[:, None]).sqrt().float()
+        far = torch.tensor([width, height], dtype=xy.dtype, device=xy.device)
+        outside = (xy - xy.clamp(torch.zeros_like(far), far)).abs()
+        drawn = (outside <= reach).all(1) & (splats.opacity >= rules.alpha_min)
+        return torch.where(drawn[:, None], reach.ceil().clamp(max=_LARGEST_RADIUS), 0.0).int()[None].contiguous()
 
 
 def _takes_two_radii(version: str) -> bool:

@@ -11,8 +11,9 @@ import pytest
 import torch
 
 from ihbench.kernels.splats import Gaussians, body_gaussians, compare_with_twin
-from ihbench.render import splat_numba, splat_reference
+from ihbench.render import splat_compositing, splat_numba, splat_reference
 from ihbench.render.splat import render_gaussians
+from ihbench.render.splat_tiles import depth_order
 from ihbench.render.splats import Splats
 from tests.render.test_splat import front_camera, random_gaussians
 
@@ -78,8 +79,14 @@ SCENES = {
 }
 
 
+@pytest.fixture(params=["vectors", "plain"])
+def kernels(request, monkeypatch):
+    """The kernels with explicit vectors, and those for processors that have none worth it."""
+    monkeypatch.setattr(splat_numba, "vectors", lambda: request.param == "vectors")
+
+
 @pytest.mark.parametrize("name", SCENES)
-def test_agrees_with_the_twin(name):
+def test_agrees_with_the_twin(name, kernels):
     # a wide splat is nearly flat where it is clamped: only a narrow tolerance leaves pixels to compare
     tolerance = 1e-5 if name in ("huge", "mixed sizes") else 1e-4
     errors = compare_with_twin(SCENES[name](), "numba", background=(0.9, 0.4, 0.1), tolerance=tolerance)
@@ -100,21 +107,25 @@ def test_one_enormous_splat():
     assert errors.gradient["colors"] < 1e-5
 
 
-def test_huge_splats_do_not_fill_the_memory(monkeypatch):
-    """What lies behind splats that cover a tile is not listed: 20 000 × 256 tiles would be 5 million entries."""
+@pytest.mark.parametrize("opacity", [None, 1.0])
+def test_huge_splats_do_not_fill_the_memory(monkeypatch, opacity):
+    """What lies behind splats that cover a tile is not listed: 20 000 × 32 tiles would be 640 000 entries."""
     n = 20_000
     s = scene(n, 3, 256, 256, scale=(50.0, 60.0))
     listed = []
-    draw = splat_numba._draw
+    fill = splat_numba.fill_tiles
 
-    def spy(entries, *rest):
-        listed.append(len(entries))
-        return draw(entries, *rest)
+    def spy(*args):
+        listed.append(len(args[-1]))
+        return fill(*args)
 
-    monkeypatch.setattr(splat_numba, "_draw", spy)
+    monkeypatch.setattr(splat_numba, "fill_tiles", spy)
     with torch.no_grad():
-        rgb, alpha = render_gaussians(s.means, s.scales, s.colors, s.camera, backend="numba")
-    assert 256 <= listed[0] < 50 * 256
+        rgb, alpha = render_gaussians(
+            s.means, s.scales, s.colors, s.camera, backend="numba",
+            opacities=None if opacity is None else torch.full((n,), opacity),
+        )  # fmt: skip
+    assert 32 <= listed[0] < 50 * 32
     assert (alpha > 0.998).all()
     front = int(s.means[:, 2].argmin())
     assert torch.allclose(rgb[128, 128], s.colors[front], atol=2e-3)
@@ -137,14 +148,15 @@ def test_dropped_alphas_hide_nothing():
 def test_no_grad_stores_no_transmittances(monkeypatch):
     s = body_gaussians(500, 48)
     kept = []
-    draw = splat_numba._draw
+    draw = splat_compositing.composite_tiles
 
     def spy(*args):
-        if args[-1] == 0:  # once per image, not once per part
-            kept.append(next(a for a in args if isinstance(a, np.ndarray) and a.shape[1:] == (256,)).size)
+        state, part, _ = args[-3:]
+        if part == 0:  # once per image, not once per part
+            kept.append(state.size)
         return draw(*args)
 
-    monkeypatch.setattr(splat_numba, "_draw", spy)
+    monkeypatch.setattr(splat_compositing, "composite_tiles", spy)
     leaves = [x.clone().requires_grad_() for x in (s.means, s.scales, s.colors)]
     with torch.no_grad():
         render_gaussians(*leaves, s.camera, backend="numba")
@@ -153,12 +165,14 @@ def test_no_grad_stores_no_transmittances(monkeypatch):
     assert kept[0] == kept[2] == 0 < kept[1]
 
 
-def test_the_thread_count_changes_nothing():
+@pytest.mark.parametrize("opacity", [None, 0.5])
+def test_the_thread_count_changes_nothing(opacity, kernels):
     s = body_gaussians(4000, 128)
+    opacities = None if opacity is None else torch.full((4000,), opacity)
 
     def draw():
         leaves = [x.clone().requires_grad_() for x in (s.means, s.scales, s.colors)]
-        rgb, alpha = render_gaussians(*leaves, s.camera, backend="numba")
+        rgb, alpha = render_gaussians(*leaves, s.camera, backend="numba", opacities=opacities)
         (rgb.square().sum() + alpha.sum()).backward()
         return [rgb.detach(), alpha.detach(), *(x.grad for x in leaves)]
 
@@ -174,8 +188,7 @@ def test_the_thread_count_changes_nothing():
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
-def test_the_shares_of_the_binning_follow_the_depth():
-    """However many splats a share has, a tile's list stays in the order of depth."""
+def test_a_few_splats_follow_the_depth():
     for n in (1, 2, 7, 8, 9, 63):
         errors = compare_with_twin(scene(n, n, 40, 24, scale=(0.1, 0.3)), "numba")
         assert errors.image < 2e-5
@@ -185,18 +198,24 @@ def test_depth_order_is_stable_and_complete():
     rng = np.random.default_rng(0)
     for spread in (0.0, 1e-6, 1.0, 1e6):
         depth = (1 + spread * rng.uniform(size=3000).round(2)).astype(np.float32)
-        xy, variance = np.full((3000, 2), 5.0), np.ones(3000)
-        order = splat_numba._depth_order(xy, variance, depth.view(np.uint32), 10, 10, splat_numba.LOG_CUTOFF)
+        keys = depth.view(np.uint32)
+        order = depth_order(np.arange(3000, dtype=np.int32), keys.copy(), keys.min(), keys.max())
         assert (order == np.argsort(depth, kind="stable")).all()
 
 
 def test_an_error_in_a_thread_is_raised():
-    def kernel(part):
-        if part == 17:
+    def kernel(part, parts):
+        if part == min(17, parts - 1):
             raise RuntimeError("part 17")
 
-    with pytest.raises(RuntimeError, match="part 17"):
-        splat_numba._run(kernel, 32)
+    before = torch.get_num_threads()
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            with pytest.raises(RuntimeError, match="part 17"):
+                splat_numba._run(kernel)
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_every_part_runs_once_on_any_number_of_threads():
@@ -205,8 +224,10 @@ def test_every_part_runs_once_on_any_number_of_threads():
         for threads in (1, 2, 7):
             torch.set_num_threads(threads)
             done = []
-            splat_numba._run(done.append, 32)
-            assert sorted(done) == list(range(32))
+            splat_numba._run(lambda part, parts, done=done: done.append((part, parts)))
+            parts = done[0][1]
+            assert sorted(done) == [(part, parts) for part in range(parts)]
+            assert parts == (1 if threads == 1 else splat_numba.PARTS)
     finally:
         torch.set_num_threads(before)
 
@@ -228,19 +249,11 @@ def _draw_and_put(queue, s):
     # torch's own OpenMP threads do not survive the fork either
     torch.set_num_threads(1)
     rgb, _ = render_gaussians(s.means, s.scales, s.colors, s.camera, backend="numba")
-    splat_numba._run(lambda part: None, 32)
+    splat_numba._run(lambda part, parts: None)
     queue.put(rgb.numpy())
 
 
-def test_power_of_half():
-    t = np.concatenate([np.linspace(0, 20, 20001), [1e-30, 0.5, 19.999]]).astype(np.float32)
-    value = np.array([splat_numba._power_of_half(x) for x in t], dtype=np.float64)
-    assert np.abs(value / np.exp2(-t.astype(np.float64)) - 1).max() < 2e-7
-    assert splat_numba._power_of_half(np.float32(0)) == 1
-    assert splat_numba._power_of_half(np.float32(np.inf)) == np.float32(2.0**-20)
-
-
-def test_the_gradient_survives_the_clamp():
+def test_the_gradient_survives_the_clamp(kernels):
     """Alpha next to ALPHA_MAX in front, where 1 / (1 - alpha) is 1000: both splats' gradients stay right."""
     xy = torch.tensor([[8.5 + 0.05, 8.5], [9.0, 8.2], [8.0, 8.9]], dtype=torch.float64)
     variance = torch.tensor([1.2, 6.0, 9.0], dtype=torch.float64)
@@ -258,30 +271,28 @@ def test_the_gradient_survives_the_clamp():
 def test_the_comparison_sees_a_wrong_back_end(monkeypatch):
     """The helper behind these tests reports each kind of error where it is."""
     s = Gaussians(*random_gaussians(100), front_camera())
-    original = splat_numba.composite
+    original = splat_numba.draw_isotropic
 
-    def with_image_error(splats, *args):
-        rgb, alpha = original(splats, *args)
+    def with_image_error(*args):
+        rgb, alpha = original(*args)
         return rgb + 3e-3, alpha
 
-    def with_gradient_error(splats, *args):
-        colors = splats.colors * 1.01 - splats.colors.detach() * 0.01
-        return original(Splats(splats.xy, splats.variance, splats.depth, colors), *args)
+    def with_gradient_error(means, scales, colors, *args):
+        return original(means, scales, colors * 1.01 - colors.detach() * 0.01, *args)
 
-    def with_one_wrong_element(splats, *args):
-        factor = torch.ones(len(splats.variance), dtype=torch.float64)
+    def with_one_wrong_element(means, scales, colors, *args):
+        factor = torch.ones(len(scales))
         factor[40] = 1.5
-        variance = splats.variance * factor - splats.variance.detach() * (factor - 1)
-        return original(Splats(splats.xy, variance, splats.depth, splats.colors), *args)
+        return original(means, scales * factor - scales.detach() * (factor - 1), colors, *args)
 
-    monkeypatch.setattr(splat_numba, "composite", with_image_error)
+    monkeypatch.setattr(splat_numba, "draw_isotropic", with_image_error)
     assert compare_with_twin(s, "numba").image == pytest.approx(3e-3, rel=0.01)
-    monkeypatch.setattr(splat_numba, "composite", with_gradient_error)
+    monkeypatch.setattr(splat_numba, "draw_isotropic", with_gradient_error)
     errors = compare_with_twin(s, "numba")
     assert errors.gradient["colors"] == pytest.approx(0.01, rel=0.01)
     assert errors.gradient["means"] < 1e-4
     assert errors.image < 2e-5
-    monkeypatch.setattr(splat_numba, "composite", with_one_wrong_element)
+    monkeypatch.setattr(splat_numba, "draw_isotropic", with_one_wrong_element)
     errors = compare_with_twin(s, "numba")
     assert errors.gradient_element["scales"] > 0.05
     assert errors.image < 2e-5
@@ -305,8 +316,10 @@ torch.set_num_threads(1)
 scene = body_gaussians(2000, 64)
 leaves = [x.clone().requires_grad_() for x in (scene.means, scene.scales, scene.colors)]
 rgb, _ = render_gaussians(*leaves, scene.camera, backend="numba")
-(rgb * torch.randn(rgb.shape, generator=torch.Generator().manual_seed(0))).sum().backward()
-print(*[hashlib.sha256(x.detach().numpy().tobytes()).hexdigest() for x in (rgb, *[leaf.grad for leaf in leaves])])
+general, _ = render_gaussians(*leaves, scene.camera, backend="numba", opacities=torch.full((2000,), 0.5))
+((rgb + general) * torch.randn(rgb.shape, generator=torch.Generator().manual_seed(0))).sum().backward()
+results = (rgb, general, *[leaf.grad for leaf in leaves])
+print(*[hashlib.sha256(x.detach().numpy().tobytes()).hexdigest() for x in results])
 """
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
     first, second = (

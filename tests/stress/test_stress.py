@@ -102,9 +102,10 @@ def test_dropping_the_alpha_clamp_fails_a_named_case(cases, monkeypatch):
     """In either back end; the other cases of the clamp's kind fail with it, those of other kinds do not."""
     from ihbench.render import splat_numba, splat_reference
 
-    for kernel in (splat_numba, splat_reference):
+    for kernel, name in ((splat_numba, "draw_isotropic"), (splat_reference, "composite")):
+        original = getattr(kernel, name)
         with monkeypatch.context() as patch:
-            patch.setattr(kernel, "ALPHA_MAX", 1.0)
+            patch.setattr(kernel, name, lambda *a, draw=original: draw(*a[:-1], replace(a[-1], alpha_max=1.0)))
             assert _verdicts(cases, "splat-alpha-ceiling", "splat-huge", "splat-none") == [
                 "failed",
                 "failed",
@@ -114,10 +115,18 @@ def test_dropping_the_alpha_clamp_fails_a_named_case(cases, monkeypatch):
 
 
 @pytest.mark.parametrize(
+    ("field", "value", "case"), [("near", -math.inf, "splat-behind-near"), ("low_pass", 0.0, "splat-sub-pixel")]
+)
+def test_a_changed_preset_fails_a_named_case(cases, monkeypatch, field, value, case):
+    from ihbench.render.splats import PRESETS
+
+    monkeypatch.setitem(PRESETS, "opaque", replace(PRESETS["opaque"], **{field: value}))
+    assert _verdicts(cases, case) == ["failed"]
+
+
+@pytest.mark.parametrize(
     ("module", "name", "value", "case"),
     [
-        ("ihbench.render.splat", "NEAR", -math.inf, "splat-behind-near"),
-        ("ihbench.render.splat", "LOW_PASS", 0.0, "splat-sub-pixel"),
         ("ihbench.render.splat_numba", "T_STOP", 0.5, "splat-stack-thin"),
         ("ihbench.metrics.ssim", "K1", 0.02, "ssim-constant-uint8"),
         ("ihbench.render.zbuffer", "NEAR", -1.0, "triangle-behind-near"),

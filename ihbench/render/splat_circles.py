@@ -1,0 +1,161 @@
+"""Opaque isotropic Gaussians for the renderer on the CPU: projection, packing, row segments, and the way back.
+
+A circle's footprint is the product of one across and one down: 32 exponentials for a block of 256 pixels.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from ihbench.render.lanes import exp2, lanes, store, zeros
+from ihbench.render.splat_tiles import TILE_HEIGHT, TILE_WIDTH, close_tiles, count_tiles, f32, u64
+
+CIRCLE = 8  # floats of a packed circle: x, y, sharpness, reach, colour, padding
+CIRCLE_GRADIENT = 8  # floats of a slot: sums over dx, dy, d², colour, padding
+CIRCLE_COLOR = 4  # where the colour of a packed circle begins
+SEGMENT = 48  # floats prepared for a segment; a circle takes 32
+
+_FAST = {"contract", "nsz", "arcp"}
+HALF_LOG2_E = 0.5 / math.log(2)
+ZERO, ONE = f32(0), f32(1)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+def project_circles(
+    means, scales, colors, to_pixels, offset, focal2, low_pass, near, log_cut, height, width,
+    xy, variance, depth, order, keys,
+):  # fmt: skip
+    """World Gaussians -> xy [N, 2], variance [N], depth [N] float32; which can reach a pixel, and their keys.
+
+    Returns how many those are and the range of their keys. Left out are those behind the near plane and those with a
+    value that is not finite in float32.
+    """
+    R, t = to_pixels, offset
+    m, lowest, highest = 0, np.uint32(0xFFFFFFFF), np.uint32(0)
+    bits = depth.view(np.uint32)
+    for i in range(len(means)):
+        X, Y, Z = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
+        z = R[2, 0] * X + R[2, 1] * Y + R[2, 2] * Z + t[2]
+        inverse = 1.0 / z
+        s = np.float64(scales[i]) * inverse
+        x = f32((R[0, 0] * X + R[0, 1] * Y + R[0, 2] * Z + t[0]) * inverse)
+        y = f32((R[1, 0] * X + R[1, 1] * Y + R[1, 2] * Z + t[1]) * inverse)
+        v = f32(s * s * focal2 + low_pass)
+        xy[i, 0], xy[i, 1], variance[i], depth[i] = x, y, v, z
+        bad = x - x + (y - y) + (v - v) + (depth[i] - depth[i])  # NaN where one is not finite
+        for c in range(colors.shape[1]):
+            bad += colors[i, c] - colors[i, c]
+        dx = max(0.5 - np.float64(x), np.float64(x) - (width - 0.5), 0.0)
+        dy = max(0.5 - np.float64(y), np.float64(y) - (height - 0.5), 0.0)
+        key = bits[i]
+        order[m] = i
+        keys[m] = key
+        if bad == ZERO and depth[i] > near and dx * dx + dy * dy <= v * log_cut:
+            m += 1
+            lowest, highest = min(lowest, key), max(highest, key)
+    return m, lowest, highest
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+def pack_circles(
+    xy, variance, colors, first, order, log_cut, alpha_min, alpha_max, t_stop, height, width,
+    packed, boxes, counts, closed, let_through, slot_start,
+):  # fmt: skip
+    """Fill `packed` [M, CIRCLE] in depth order and what `splat_tiles` wants; returns the number of entries.
+
+    `packed` comes with colours of 0; they are channel `first` and the two after it. Sharpness s is such that
+    alpha = 2^-(s d)²: the exponent of a huge circle far outside the image cannot overflow.
+    """
+    entries = 0
+    channels = min(colors.shape[1] - first, 3)
+    for rank in range(len(order)):
+        i, p = u64(order[rank]), packed[u64(rank)]
+        v = variance[i]
+        # rounding of the reach must not lose a pixel: the alpha threshold decides in the end
+        reach = f32(math.sqrt(v * log_cut)) * f32(1.00005)
+        p[0], p[1], p[2], p[3] = xy[i, 0], xy[i, 1], math.sqrt(f32(HALF_LOG2_E) / v), reach
+        for c in range(channels):
+            p[CIRCLE_COLOR + c] = colors[i, first + c]
+        slot_start[rank] = entries
+        entries += count_tiles(rank, p[0], p[1], reach, reach, height, width, boxes, counts, closed)
+        if reach > f32(TILE_WIDTH):  # a smaller circle hides no tile
+            close_tiles(
+                rank, p[0], p[1], ZERO, p[2], p[2], ZERO, alpha_min, alpha_max, t_stop, width, boxes, let_through,
+                closed,
+            )  # fmt: skip
+    slot_start[len(order)] = entries
+    return entries
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def hidden(dead, column, last_column, row, last_row):
+    """Whether the 16×16 px cells under the corners of a block of at most that size let nothing through."""
+    stride = TILE_WIDTH // 16 + 1
+    left, right = u64(column // 16), u64(last_column // 16)
+    top, bottom = u64(row // 16 * stride), u64(last_row // 16 * stride)
+    return dead[top + left] & dead[top + right] & dead[bottom + left] & dead[bottom + right]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST, forceinline=True)
+def circle_segments(packed, rank, position, x0, y0, dead, test, prepared, segments, n):
+    """Cut a circle's part of a tile, whose first pixel centre is (x0, y0), into blocks of at most 16×16 px.
+
+    `prepared` gets 16 factors across and 16 down, segments[n] first column, first row, rows, rank, position in the
+    list. Returns n, advanced; with `test` not advanced where all of the splat is hidden. Whole splats only: the
+    backward pass undoes each of its blocks and could not know of one left out.
+    """
+    x, y, sharp, reach = packed[rank, 0] - x0, packed[rank, 1] - y0, packed[rank, 2], packed[rank, 3]
+    column = np.int32(max(x - reach + ONE, ZERO))
+    column_end = np.int32(min(max(x + reach + ONE, ZERO), f32(TILE_WIDTH)))
+    row = np.int32(max(y - reach + ONE, ZERO))
+    row_end = np.int32(min(max(y + reach + ONE, ZERO), f32(TILE_HEIGHT)))
+    before, alive = n, not test
+    for c in range(column, column_end, 16):
+        dx = (lanes() + (f32(c) - x)) * sharp
+        across = exp2(zeros() - dx * dx)
+        for q in range(row, row_end, 16):
+            rows = min(row_end - q, 16)
+            alive |= not hidden(dead, c, min(c + 15, column_end - 1), q, q + rows - 1)
+            dy = (lanes() + (f32(q) - y)) * sharp
+            store(prepared, n * SEGMENT, across)
+            store(prepared, n * SEGMENT + 16, exp2(zeros() - dy * dy))
+            segments[n, 0], segments[n, 1], segments[n, 2] = c, q, rows
+            segments[n, 3], segments[n, 4] = rank, position
+            n += 1
+    return n if alive else before
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+def circle_gradients(
+    slots, order, slot_start, xy, variance, depth, scales, to_pixels, focal2, first,
+    grad_means, grad_scales, grad_colors, part, parts,
+):  # fmt: skip
+    """Slots -> one part of the gradients of means [N, 3], scales [N], colors [N, C], through the projection.
+
+    Adds to means and scales, for each group of three channels that is drawn adds its own.
+    """
+    R, m = to_pixels, len(order)
+    channels = min(grad_colors.shape[1] - first, 3)
+    for rank in range(m * part // parts, m * (part + 1) // parts):
+        i = u64(order[rank])
+        sx = sy = sd = r = g = b = 0.0
+        for k in range(slot_start[rank], slot_start[rank + 1]):
+            e = slots[k]
+            sx, sy, sd = sx + e[0], sy + e[1], sd + e[2]
+            r, g, b = r + e[3], g + e[4], b + e[5]
+        v, inverse, s = np.float64(variance[i]), 1.0 / np.float64(depth[i]), np.float64(scales[i])
+        gx, gy = sx / v, sy / v  # along the centre
+        gs = focal2 * s * inverse * inverse * (sd / v / v)  # along the scale
+        grad_scales[i] += gs
+        px, py = gx * inverse, gy * inverse
+        pz = -(gx * xy[i, 0] + gy * xy[i, 1] + gs * s) * inverse
+        for c in range(3):
+            grad_means[i, c] += R[0, c] * px + R[1, c] * py + R[2, c] * pz
+        grad_colors[i, first] = r
+        if channels > 1:
+            grad_colors[i, first + 1] = g
+        if channels > 2:
+            grad_colors[i, first + 2] = b
