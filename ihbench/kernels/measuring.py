@@ -34,6 +34,8 @@ class Row:
     gradient_error: float | None
     ratio: float = 1.0  # forward time over that of the first back end of its case
     knob: str = ""  # what a case's rows differ in, where that is a setting
+    processor_ms: float | None = None  # of all threads, forward and backward; median
+    pairs_per_second: float | None = None  # pairs of pixel and splat, forward and backward
 
 
 def timed(step: Callable[[], object]) -> Sample:

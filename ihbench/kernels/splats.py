@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,6 +18,15 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 SPLAT_CASES = (("5k@128", 5_000, 128), ("20k@256", 20_000, 256), ("50k@512", 50_000, 512), ("200k@512", 200_000, 512))
+# case, Gaussians, px, opacity, ratio of the longest to the shortest axis
+GENERAL_CASES = (
+    ("5k@128 o1", 5_000, 128, 1.0, 1.0),
+    ("20k@256 o.5 1:5", 20_000, 256, 0.5, 5.0),
+    ("50k@512 o1 1:5", 50_000, 512, 1.0, 5.0),
+    ("50k@512 o.5 1:5", 50_000, 512, 0.5, 5.0),
+    ("50k@512 o.1 1:5", 50_000, 512, 0.1, 5.0),
+)
+LARGE_CASES = (("200k@1024 o.5 1:5", 200_000, 1024, 0.5, 5.0), ("500k@1024 o.5 1:5", 500_000, 1024, 0.5, 5.0))
 NO_GRADIENT = 1e-12  # a scene of clamped alphas has gradients of 1e-30; they mean 0
 WINDOW = 64  # px; side of the window in which the float64 twin is drawn
 
@@ -175,44 +185,102 @@ def _element_error(value: Tensor, truth: Tensor) -> float:
     return float(((value - truth).abs() / truth.abs().clamp(min=floor)).max())
 
 
-def splat_rows(repeats: int, cases: Sequence[tuple[str, int, int]] = SPLAT_CASES) -> list[Row]:
-    """Every splat back end that can run here, on every case; the twin is timed once, on the smallest."""
+def general_gaussians(count: int, size: int, opacity: float, ratio: float, seed: int = 0) -> Gaussians:
+    """The figure of `body_gaussians` from ellipsoids of one opacity, longest to shortest axis 1:`ratio`, each of the
+    volume of the sphere that it stands for and turned at random."""
     import torch
 
-    from ihbench.render.splat import render_gaussians
+    spheres = body_gaussians(count, size, seed)
+    generator = torch.Generator().manual_seed(seed)
+    spheres = replace(spheres, opacities=torch.full((count,), opacity), preset="3dgs")
+    if ratio == 1:  # a sphere has no gradient along its turn that an error could be relative to
+        return spheres
+    along = torch.tensor([0.5, 0.0, -0.5]) * math.log(ratio)
+    quaternions = torch.randn(count, 4, generator=generator)
+    return replace(spheres, scales=spheres.scales[:, None] * along.exp(), quaternions=quaternions)
 
+
+def splat_rows(repeats: int, cases: Sequence[tuple[str, int, int]] = SPLAT_CASES) -> list[Row]:
+    """Every splat back end that can run here, on every case; the twin is timed once, on the smallest."""
     rows = []
     for case, count, size in cases:
-        scene = body_gaussians(count, size)
-        on = {"cpu": scene}
-        if torch.cuda.is_available():
-            on["cuda"] = Gaussians(scene.means.cuda(), scene.scales.cuda(), scene.colors.cuda(), scene.camera)
-        backends = ["numba", *(["gsplat"] if "cuda" in on and find_spec("gsplat") is not None else [])]
-
-        def step(backend: str, scenes: dict[str, Gaussians] = on) -> tuple[float, float]:
-            scene = scenes["cuda" if backend == "gsplat" else "cpu"]
-            leaves = [x.detach().requires_grad_() for x in (scene.means, scene.scales, scene.colors)]
-            pull = torch.ones(scene.camera.height, scene.camera.width, 3, device=scene.means.device)
-            _synchronize(scene.means)
-            start = time.perf_counter()
-            rgb, _ = render_gaussians(leaves[0], leaves[1], leaves[2], scene.camera, backend=backend)
-            _synchronize(rgb)
-            middle = time.perf_counter()
-            rgb.backward(pull)
-            _synchronize(rgb)
-            return (middle - start) * 1e3, (time.perf_counter() - middle) * 1e3
-
-        timings = interleave({b: lambda b=b: step(b) for b in backends}, repeats)
-        if case == cases[0][0]:
-            timings |= interleave({"reference": lambda: step("reference")}, 1, warm_up=0)
-        for backend, samples in timings.items():
-            image = gradient = 0.0
-            if backend != "reference":
-                errors = compare_with_twin(_window(on["cuda" if backend == "gsplat" else "cpu"]), backend)
-                image, gradient = errors.image, max(errors.gradient.values())
-            memory = peak_mib(lambda b=backend: step(b)) if backend == "numba" else None
-            rows.append(row_of("splat", case, backend, samples, memory, image, gradient))
+        rows += _rows_of("splat", case, body_gaussians(count, size), repeats, twin=case == cases[0][0])
     return rows
+
+
+def general_splat_rows(
+    repeats: int, cases: Sequence[tuple[str, int, int, float, float]] = GENERAL_CASES
+) -> list[Row]:
+    """The same for general Gaussians: opacity, ellipsoids."""
+    rows = []
+    for case, count, size, opacity, ratio in cases:
+        scene = general_gaussians(count, size, opacity, ratio)
+        rows += _rows_of("splat-general", case, scene, repeats, twin=case == cases[0][0])
+    return rows
+
+
+def large_splat_rows(repeats: int) -> list[Row]:
+    """Sizes that take their time; only where they are asked for by name."""
+    return [replace(row, kernel="splat-large") for row in general_splat_rows(repeats, LARGE_CASES)]
+
+
+def _rows_of(kernel: str, case: str, scene: Gaussians, repeats: int, twin: bool) -> list[Row]:
+    import torch
+
+    on = {"cpu": scene}
+    if torch.cuda.is_available():
+        on["cuda"] = replace(scene, **{name: x.cuda() for name, x in scene.tensors().items()})
+    backends = ["numba", *(["gsplat"] if "cuda" in on and find_spec("gsplat") is not None else [])]
+    processor: dict[str, list[float]] = {}
+
+    def step(backend: str) -> tuple[float, float]:
+        scene = on["cuda" if backend == "gsplat" else "cpu"]
+        leaves = {name: x.detach().requires_grad_() for name, x in scene.tensors().items()}
+        pull = torch.ones(scene.camera.height, scene.camera.width, 3, device=scene.means.device)
+        _synchronize(scene.means)
+        start, busy = time.perf_counter(), time.process_time()
+        rgb, _ = scene.draw(leaves, backend)
+        _synchronize(rgb)
+        middle = time.perf_counter()
+        rgb.backward(pull)
+        _synchronize(rgb)
+        processor.setdefault(backend, []).append((time.process_time() - busy) * 1e3)
+        return (middle - start) * 1e3, (time.perf_counter() - middle) * 1e3
+
+    timings = interleave({b: lambda b=b: step(b) for b in backends}, repeats)
+    if twin:
+        timings |= interleave({"reference": lambda: step("reference")}, 1, warm_up=0)
+    pairs = pixel_pairs(scene)
+    rows = []
+    for backend, samples in timings.items():
+        image = gradient = 0.0
+        if backend != "reference":
+            errors = compare_with_twin(_window(on["cuda" if backend == "gsplat" else "cpu"]), backend)
+            image, gradient = errors.image, max(errors.gradient.values())
+        memory = peak_mib(lambda b=backend: step(b)) if backend == "numba" else None
+        spent = processor[backend][: -1 if memory is not None else None][-repeats:]  # the last one was for the memory
+        row = row_of(kernel, case, backend, samples, memory, image, gradient)
+        seconds = (row.forward_ms + (row.backward_ms or 0.0)) / 1e3
+        rows.append(replace(row, processor_ms=float(np.median(spent)), pairs_per_second=pairs / seconds))
+    return rows
+
+
+def pixel_pairs(scene: Gaussians) -> float:
+    """Pixels that the footprints cover, all splats together, inside the image or not, hidden or not: what a renderer
+    without any skipping would draw."""
+    from ihbench.render.splat import project_gaussians
+    from ihbench.render.splats import PRESETS, as_ellipses
+
+    rules = PRESETS[scene.preset]
+    s = as_ellipses(
+        project_gaussians(
+            scene.means, scene.scales, scene.colors.flatten(1)[:, :1], scene.camera, quaternions=scene.quaternions,
+            opacities=scene.opacities, preset=scene.preset,
+        )
+    )  # fmt: skip
+    xx, both, yy = s.covariance.unbind(1)
+    cut = 2 * (s.opacity.double() / rules.alpha_min).clamp(min=1).log()
+    return float((math.pi * cut * (xx * yy - both * both).sqrt()).sum())
 
 
 def _window(scene: Gaussians) -> Gaussians:

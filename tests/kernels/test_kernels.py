@@ -54,6 +54,29 @@ def test_every_back_end_gets_a_row(small):
     assert "load" in out
 
 
+def test_general_splats_get_rows_with_their_processor_time(monkeypatch):
+    cases = (("200@48", 200, 48, 0.5, 5.0), ("400@48", 400, 48, 1.0, 1.0))
+    monkeypatch.setattr(splats, "WINDOW", 32)
+    monkeypatch.setitem(table.KERNELS, "splat-general", lambda repeats: splats.general_splat_rows(repeats, cases))
+    rows = table.run_kernels(["splat-general"], repeats=2)
+    assert [(r.case, r.backend) for r in rows] == [("200@48", "numba"), ("200@48", "reference"), ("400@48", "numba")]
+    for row in rows:
+        assert row.processor_ms > 0
+        assert row.pairs_per_second > 0
+        assert row.value_error < 1e-4
+        assert row.gradient_error < 1e-3
+    assert "Mpairs/s" in shown(rows)
+    assert "splat-large" not in table.KERNELS
+
+
+def test_pixel_pairs_are_the_area_of_the_footprints():
+    scene = splats.general_gaussians(1, 64, 1.0, 1.0)
+    scene = replace(scene, means=scene.means * 0, scales=scene.scales * 0 + 0.1)
+    (z,) = (scene.camera.R[2] @ np.zeros(3) + scene.camera.t[2],)
+    variance = (1.03 * 64 * 0.1 / z) ** 2 + 0.3
+    assert splats.pixel_pairs(scene) == pytest.approx(math.pi * 2 * math.log(255) * variance, rel=0.01)
+
+
 def test_json_is_one_object(small, bench):
     printed = json.loads(bench("kernels", "zbuffer", "--repeats", "1", "--json").out)
     assert [row["backend"] for row in printed["rows"]] == ["numpy", "numba"]
