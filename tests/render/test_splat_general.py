@@ -1,7 +1,7 @@
 """General Gaussians: covariance, opacity, spherical harmonics, depth and the screen gradient, in every back end.
 
-Agreement tests 1 to 5 by number: 1 circles on the axis, 2 twin and kernel for all six gradients, 3 rotation, 4 one and
-two splats by hand, 5 widths that are no multiple of 16.
+Agreement tests 1 to 5 by number: 1 circles on the axis, 2 twin and kernel for all six gradients, 3 rotation, 4 one
+and two splats by hand, 5 widths that are no multiple of 16.
 """
 
 import math
@@ -125,12 +125,12 @@ def test_2_and_5_the_kernel_is_the_twin(name, kernels):
     allowed = 1e-3 if "stack" in name else 1e-4
     for tensor, error in errors.gradient.items():
         assert error < allowed, tensor
-        assert errors.gradient_element[tensor] < 2e-3, tensor
+        assert errors.gradient_element[tensor] < 20 * allowed, tensor
 
 
 @both
 def test_1_opaque_spheres_on_the_axis_are_the_circles(backend):
-    means, scales, colors = random_gaussians(30, dtype=torch.float64)
+    _, scales, colors = random_gaussians(30, dtype=torch.float64)
     for z in (1.0, 2.0):
         at = torch.tensor([[0.0, 0, z]], dtype=torch.float64)
         circle = render_gaussians(at, scales[:1], colors[:1], front_camera(), backend=backend)
