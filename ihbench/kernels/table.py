@@ -88,9 +88,9 @@ def blocks_of(here: Machine, rows: Sequence[Row]) -> list[Block]:
         " the forward time to that of the case's first row; cpu ms: processor time of forward and backward; Mpairs/s:"
         " pixels under all splats' footprints, in millions, over both times. Errors of splats are against the float64"
         f" twin in a window of {WINDOW}² px (image: largest; gradient: relative norm), those of the z-buffer its"
-        " depth's, in m, against numpy, those of metrics against the float64 oracle on a small frame (LPIPS: against its"
-        " package in float64), those of skinning and position maps the largest distance in m from float64 numpy, those of the"
-        " sampler the rms over hidden pixels from many steps in float64."
+        " depth's, in m, against numpy, those of metrics against the float64 oracle on a small frame (LPIPS: against"
+        " its package in float64), those of skinning and position maps the largest distance in m from float64 numpy,"
+        " those of the sampler the rms over hidden pixels from many steps in float64."
     )
     return [Table(head, tuple(cells), left=3), *map(Paragraph, lines)]
 

@@ -139,6 +139,42 @@ def test_image_and_gradients_are_the_twins(fake, channels):
         assert torch.allclose(g, truth, rtol=1e-3, atol=1e-3 * float(truth.abs().max()))
 
 
+@pytest.mark.parametrize("preset", ["opaque", "3dgs"])
+def test_general_images_and_gradients_are_the_twins(fake, preset):
+    """Few and faint enough that no pixel ends early, which the stand-in does not do."""
+    g = torch.Generator().manual_seed(2)
+    means, _, colors = random_gaussians(25)
+    inputs = means, 0.02 + 0.15 * torch.rand(25, 3, generator=g), colors, torch.randn(25, 4, generator=g)
+    opacities = 0.01 + 0.5 * torch.rand(25, generator=g)
+    pull = torch.randn(21, 37, 4, generator=g)
+
+    def draw(backend):
+        leaves = [x.clone().requires_grad_() for x in (*inputs, opacities)]
+        image = render_gaussians(
+            *leaves[:3], front_camera(37, 21), backend=backend, quaternions=leaves[3], opacities=leaves[4],
+            preset=preset,
+        )  # fmt: skip
+        image = torch.cat([x.reshape(21, 37, -1) for x in image], -1)
+        return image.detach(), torch.autograd.grad(image, leaves, pull)
+
+    image, gradients = draw("gsplat")
+    true_image, true_gradients = draw("reference")
+    assert torch.allclose(image, true_image, atol=1e-4)
+    for g, truth in zip(gradients, true_gradients, strict=True):
+        assert torch.allclose(g, truth, rtol=1e-3, atol=1e-3 * float(truth.abs().max()))
+
+
+def test_3dgs_opacities_are_cut_where_an_older_gsplat_would_draw_more(fake):
+    _, alpha = render_gaussians(*ONE, front_camera(41, 29), backend="gsplat", preset="3dgs")
+    assert float(alpha.max()) == pytest.approx(0.99, abs=1e-6)
+
+
+def test_a_gsplat_of_the_3dgs_alpha_draws_it(monkeypatch):
+    monkeypatch.setattr(splat_gsplat, "_gsplat", lambda device: FakeGsplat("1.6.0", True, 0.99))
+    _, alpha = render_gaussians(*ONE, front_camera(41, 29), backend="gsplat", preset="3dgs")
+    assert float(alpha.max()) == pytest.approx(0.99, abs=1e-6)
+
+
 def test_a_splat_far_outside_makes_no_pairs(fake):
     means = torch.tensor([[50.0, 0.0, 2.0], [0.0, -50.0, 2.0]])
     rgb, _ = render_gaussians(means, torch.full((2,), 0.1), torch.zeros(2, 3), front_camera(), backend="gsplat")
