@@ -38,10 +38,10 @@ class FakeGsplat:
         assert sort
         assert not packed
         assert not means2d.requires_grad
-        radius = radii[0, :, 0] if self.two_radii else radii[0]
+        radius = radii[0] if self.two_radii else radii[0][:, None].expand(-1, 2)
         pairs = []
         for i in range(n):
-            if radius[i] <= 0:
+            if (radius[i] <= 0).any():
                 continue
             low = torch.floor((means2d[0, i] - radius[i]) / tile_size).long()
             high = torch.ceil((means2d[0, i] + radius[i]) / tile_size).long()
