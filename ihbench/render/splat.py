@@ -60,6 +60,10 @@ class Screen:
         """[N] bool: those that reach a pixel, be they hidden behind others or not."""
         return self.radius > 0
 
+    def add(self, gradient: Tensor) -> None:
+        """One more backward pass's gradient along the centres, [N, 2] per px."""
+        self.gradient = gradient if self.gradient is None else self.gradient + gradient
+
 
 @overload
 def render_gaussians(
@@ -146,10 +150,15 @@ def render_gaussians(
         channels = torch.cat([colors, depths(means, camera).to(colors.dtype)[:, None]], 1)
         background = torch.cat([background, background.new_zeros(1)])
     screen = None
-    if circles and backend == "numba" and "screen" not in outputs and _has_vectors():
-        from ihbench.render.splat_numba import draw_isotropic
+    if backend == "numba" and (not circles or _has_vectors()):
+        from ihbench.render.splat_numba import draw_gaussians, draw_isotropic
 
-        picture, alpha = draw_isotropic(means, scales, channels, camera, background, rules)
+        screen = Screen(means.new_zeros(len(means))) if "screen" in outputs else None
+        inputs = (means, scales, channels, camera, background, rules)
+        if circles:
+            picture, alpha = draw_isotropic(*inputs, screen)
+        else:
+            picture, alpha = draw_gaussians(*inputs, quaternions, opacities, screen)
     else:
         splats, keep = _project(means, scales, channels, camera, quaternions, opacities, rules, circles)
         if "screen" in outputs:
@@ -226,8 +235,7 @@ def _screen(splats: Splats | Ellipses, keep: Tensor | None, means: Tensor, camer
     screen = Screen(of_all(radii(as_ellipses(splats), camera.height, camera.width, rules)))
 
     def fill(gradient: Tensor) -> None:
-        new = of_all(gradient.detach())
-        screen.gradient = new if screen.gradient is None else screen.gradient + new
+        screen.add(of_all(gradient.detach()))
 
     if splats.xy.requires_grad:
         splats.xy.register_hook(fill)

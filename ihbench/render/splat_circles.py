@@ -31,7 +31,7 @@ def project_circles(
     """World Gaussians -> xy [N, 2], variance [N], depth [N] float32; which can reach a pixel, and their keys.
 
     Returns how many those are and the range of their keys. Left out are those behind the near plane and those with a
-    value that is not finite in float32.
+    value that is not finite in float32; their variance is 0.
     """
     R, t = to_pixels, offset
     m, lowest, highest = 0, np.uint32(0xFFFFFFFF), np.uint32(0)
@@ -48,12 +48,15 @@ def project_circles(
         bad = x - x + (y - y) + (v - v) + (depth[i] - depth[i])  # NaN where one is not finite
         for c in range(colors.shape[1]):
             bad += colors[i, c] - colors[i, c]
+        if not (bad == ZERO and depth[i] > near):
+            variance[i] = ZERO
+            continue
         dx = max(0.5 - np.float64(x), np.float64(x) - (width - 0.5), 0.0)
         dy = max(0.5 - np.float64(y), np.float64(y) - (height - 0.5), 0.0)
         key = bits[i]
         order[m] = i
         keys[m] = key
-        if bad == ZERO and depth[i] > near and dx * dx + dy * dy <= v * log_cut:
+        if dx * dx + dy * dy <= v * log_cut:
             m += 1
             lowest, highest = min(lowest, key), max(highest, key)
     return m, lowest, highest
@@ -131,11 +134,12 @@ def circle_segments(packed, rank, position, x0, y0, dead, test, prepared, segmen
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
 def circle_gradients(
     slots, order, slot_start, xy, variance, depth, scales, to_pixels, focal2, first,
-    grad_means, grad_scales, grad_colors, part, parts,
+    grad_means, grad_scales, grad_colors, grad_xy, part, parts,
 ):  # fmt: skip
-    """Slots -> one part of the gradients of means [N, 3], scales [N], colors [N, C], through the projection.
+    """Slots -> one part of the gradients of means [N, 3], scales [N], colors [N, C], through the projection, and
+    where grad_xy [N, 2] is not empty of the centres.
 
-    Adds to means and scales, for each group of three channels that is drawn adds its own.
+    Adds to all but the colours, for each group of three channels that is drawn adds its own.
     """
     R, m = to_pixels, len(order)
     channels = min(grad_colors.shape[1] - first, 3)
@@ -150,6 +154,9 @@ def circle_gradients(
         gx, gy = sx / v, sy / v  # along the centre
         gs = focal2 * s * inverse * inverse * (sd / v / v)  # along the scale
         grad_scales[i] += gs
+        if len(grad_xy):
+            grad_xy[i, 0] += gx
+            grad_xy[i, 1] += gy
         px, py = gx * inverse, gy * inverse
         pz = -(gx * xy[i, 0] + gy * xy[i, 1] + gs * s) * inverse
         for c in range(3):

@@ -1,8 +1,9 @@
 """The splat renderer on the CPU: numba, tiles of 64×32 px, explicit 16-lane vectors, analytic backward pass.
 
-`splat_tiles` orders the splats and lists them per tile, `splat_circles` and `splat_ellipses` pack and cut them,
-`splat_compositing` draws the tiles; `README.md` beside them has what was tried and what it took. Opaque isotropic
-Gaussians go from the world to the picture and back in one piece (`draw_isotropic`); everything else comes projected.
+`splat_gaussians` and `splat_circles` project, `splat_tiles` orders the splats and lists them per tile,
+`splat_ellipses` and `splat_circles` pack and cut them, `splat_compositing` draws the tiles; `README.md` beside them
+has what was tried and what it took. Gaussians go from the world to the picture and back in one piece
+(`draw_gaussians`, and `draw_isotropic` for opaque circles); `composite` takes projected ones.
 
 Early stop: where no pixel of a 16×16 px cell lets through `T_STOP`, splats under such cells alone are left out. That
 changes a colour by less than T_STOP times the range of colours, and the gradient of an alpha by less than
@@ -19,13 +20,13 @@ Nothing is shared by two calls: what the backward pass needs belongs to its own 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
 from math import log
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -43,8 +44,13 @@ from ihbench.render.splat_ellipses import (
     pack_ellipses,
     visible_ellipses,
 )  # fmt: skip
+from ihbench.render.splat_gaussians import gaussian_gradients, project_gaussians
+from ihbench.render.splat_projection import clamped_directions, intrinsics, radii
 from ihbench.render.splat_tiles import OPEN, TILE_HEIGHT, TILE_WIDTH, depth_order, fill_tiles
 from ihbench.render.splats import PRESETS, Ellipses, Preset, Splats, as_ellipses
+
+if TYPE_CHECKING:
+    from ihbench.render.splat import Screen
 
 T_STOP = 1e-5  # a transmittance below it counts as none
 T_LEAST = 1e-10  # what a preset that never stops stops at, against underflow
@@ -57,7 +63,8 @@ f32 = np.float32
 def composite(
     splats: Splats | Ellipses, height: int, width: int, background: Tensor, preset: Preset | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Splats and background [C] -> rgb [H, W, C], alpha [H, W], float32. Conventions: `ihbench.render.splat`."""
+    """Projected splats and background [C] -> rgb [H, W, C], alpha [H, W], float32. Conventions:
+    `ihbench.render.splat`."""
     s = as_ellipses(splats)
     inputs = (s.xy, s.covariance, s.opacity, s.colors)
     # autograd switches the grad mode off inside a Function, so whether to keep anything is decided here
@@ -65,17 +72,42 @@ def composite(
     return _composite_ellipses(*inputs, s.depth, height, width, background, preset or PRESETS["opaque"], keep)
 
 
-def draw_isotropic(
-    means: Tensor, scales: Tensor, colors: Tensor, camera: Camera, background: Tensor, preset: Preset
+def draw_gaussians(
+    means: Tensor,
+    shapes: Tensor,
+    colors: Tensor,
+    camera: Camera,
+    background: Tensor,
+    preset: Preset,
+    quaternions: Tensor | None = None,
+    opacities: Tensor | None = None,
+    screen: Screen | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Opaque isotropic Gaussians in the world -> rgb [H, W, C], alpha [H, W], float32; see `render_gaussians`.
+    """General Gaussians in the world -> rgb [H, W, C], alpha [H, W], float32; see `render_gaussians`.
 
-    Gaussians that are not finite are left out and get a zero gradient.
+    Fills in the radius of `screen`, and its gradient in every backward pass. Gaussians that are not finite are left
+    out and get a zero gradient.
     """
+    opacities = means.new_ones(len(means)) if opacities is None else opacities
+    inputs = (means, shapes, quaternions, opacities, colors)
+    keep = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in inputs)
+    return _composite_gaussians(*inputs, camera, background, preset, keep, screen)
+
+
+def draw_isotropic(
+    means: Tensor,
+    scales: Tensor,
+    colors: Tensor,
+    camera: Camera,
+    background: Tensor,
+    preset: Preset,
+    screen: Screen | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Opaque isotropic Gaussians in the world as circles; otherwise as `draw_gaussians`."""
     if not vectors():
         raise RuntimeError("circles are drawn with explicit vectors only")
     keep = torch.is_grad_enabled() and any(x.requires_grad for x in (means, scales, colors))
-    return _composite_circles(means, scales, colors, camera, background, preset, keep)
+    return _composite_circles(means, scales, colors, camera, background, preset, keep, screen)
 
 
 def vectors() -> bool:
@@ -197,6 +229,10 @@ def _pulls(grad_rgb: Tensor, grad_alpha: Tensor) -> list[tuple[NDArray[np.float3
     return [(g, np.zeros_like(alpha) if k else alpha) for k, g in enumerate(groups)]
 
 
+def _tensors(arrays: Iterable[NDArray[Any]], dtypes: Iterable[torch.dtype]) -> list[Tensor]:
+    return [torch.from_numpy(a).to(dtype) for a, dtype in zip(arrays, dtypes, strict=True)]
+
+
 def _array(x: Tensor) -> NDArray[Any]:
     """Without a copy where it is float32 or float64 already."""
     x = x.detach()
@@ -211,10 +247,9 @@ class _Circles(torch.autograd.Function):
     """means [N, 3], scales [N], colors [N, C] -> rgb [H, W, C], alpha [H, W]."""
 
     @staticmethod
-    def forward(ctx: Any, means, scales, colors, camera, background, preset, keep) -> Any:
+    def forward(ctx: Any, means, scales, colors, camera, background, preset, keep, screen) -> Any:
         n, height, width = len(means), camera.height, camera.width
-        K = np.triu(camera.K)
-        K[2, 2] = 1.0
+        K = intrinsics(camera)
         to_pixels, offset, focal2 = K @ camera.R, K @ camera.t, K[0, 0] * K[1, 1]
         ctx.dtypes = means.dtype, scales.dtype, colors.dtype
         means, scales, colors = _array(means), _array(scales), _array(colors.float())
@@ -232,24 +267,29 @@ class _Circles(torch.autograd.Function):
                   (height, width), keep, rgb, alpha)
             for first, bg, rgb, alpha in groups.each()
         ]  # fmt: skip
+        if screen is not None:
+            circles = (torch.from_numpy(x) for x in (xy, variance, depth, colors))
+            screen.radius = radii(as_ellipses(Splats(*circles)), height, width, preset).to(ctx.dtypes[0])
         if keep:
-            ctx.saved = passes, order, xy, variance, depth, scales, to_pixels, focal2, colors.shape[1]
+            ctx.saved = passes, order, xy, variance, depth, scales, to_pixels, focal2, colors.shape[1], screen
         return groups.picture(), groups.alpha
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grad_outputs: Any) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        passes, order, xy, variance, depth, scales, to_pixels, focal2, channels = ctx.saved
+        passes, order, xy, variance, depth, scales, to_pixels, focal2, channels, screen = ctx.saved
         n = len(scales)
         grads = np.zeros((n, 3), scales.dtype), np.zeros(n, scales.dtype), np.zeros((n, channels), f32)
+        grad_xy = np.zeros((0 if screen is None else n, 2), scales.dtype)
         for k, (of, pull) in enumerate(zip(passes, _pulls(*grad_outputs), strict=True)):
             slots = _draw_backward(of, *pull)
             _run(
                 circle_gradients, slots, order, of.slot_start, xy, variance, depth, scales, to_pixels, focal2,
-                k * CHANNELS, *grads,
+                k * CHANNELS, *grads, grad_xy,
             )  # fmt: skip
-        as_given = [torch.from_numpy(g).to(dtype) for g, dtype in zip(grads, ctx.dtypes, strict=True)]
-        return *as_given, None, None, None, None
+        if screen is not None and ctx.needs_input_grad[0]:
+            screen.add(torch.from_numpy(grad_xy).to(ctx.dtypes[0]))
+        return *_tensors(grads, ctx.dtypes), *[None] * 5
 
 
 _composite_circles: Callable[..., tuple[Tensor, Tensor]] = _Circles.apply
@@ -259,44 +299,137 @@ _composite_circles: Callable[..., tuple[Tensor, Tensor]] = _Circles.apply
 # Ellipses
 
 
+@dataclass(frozen=True)
+class _Drawn:
+    """Ellipses of a picture, and what its backward pass needs."""
+
+    passes: list[_Pass]
+    order: NDArray[np.int32]  # [M] indices of what is drawn, by depth
+    opacity: NDArray[np.float64]  # [N]
+    channels: int
+
+    def gradients(self, grad_rgb: Tensor, grad_alpha: Tensor) -> tuple[NDArray[Any], ...]:
+        """Of xy [N, 2], covariance [N, 3], opacity [N] and colors [N, C]."""
+        n = len(self.opacity)
+        grads = np.zeros((n, 2)), np.zeros((n, 3)), np.zeros(n), np.zeros((n, self.channels), f32)
+        for k, (of, pull) in enumerate(zip(self.passes, _pulls(grad_rgb, grad_alpha), strict=True)):
+            slots = _draw_backward(of, *pull)
+            _run(ellipse_gradients, slots, self.order, of.slot_start, of.packed, self.opacity, k * CHANNELS, *grads)
+        return grads
+
+
+def _draw_ellipses(
+    xy: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+    opacity: NDArray[np.float64],
+    colors: NDArray[np.float32],
+    depth: NDArray[np.float32],
+    size: tuple[int, int],
+    background: Tensor,
+    preset: Preset,
+    keep: bool,
+) -> tuple[_Groups, _Drawn]:
+    n = len(xy)
+    order, keys = np.empty(n + 1, np.int32), np.empty(n + 1, np.uint32)
+    m, lowest, highest = visible_ellipses(xy, covariance, opacity, depth, preset.alpha_min, *size, order, keys)
+    order = depth_order(order[:m], keys[:m], np.uint32(lowest), np.uint32(highest))
+    groups = _Groups(*size, colors.shape[1], background)
+    passes = [
+        _draw(True, pack_ellipses, (xy, covariance, opacity, colors, first, order), m, preset, bg, size, keep, rgb,
+              alpha)
+        for first, bg, rgb, alpha in groups.each()
+    ]  # fmt: skip
+    return groups, _Drawn(passes, order, opacity, colors.shape[1])
+
+
 class _Ellipses(torch.autograd.Function):
     """xy [M, 2], covariance [M, 3], opacity [M], colors [M, C], depth [M] -> rgb [H, W, C], alpha [H, W]."""
 
     @staticmethod
     def forward(ctx: Any, xy, covariance, opacity, colors, depth, height, width, background, preset, keep) -> Any:
-        n = len(xy)
         ctx.dtypes = xy.dtype, covariance.dtype, opacity.dtype, colors.dtype
-        xy, covariance, opacity = (x.detach().double().contiguous().numpy() for x in (xy, covariance, opacity))
-        colors, depth = (x.detach().float().contiguous().numpy() for x in (colors, depth))
-        order, keys = np.empty(n + 1, np.int32), np.empty(n + 1, np.uint32)
-        m, lowest, highest = visible_ellipses(
-            xy, covariance, opacity, depth, preset.alpha_min, height, width, order, keys
+        xy, covariance, opacity = (_array(x.double()) for x in (xy, covariance, opacity))
+        colors, depth = (_array(x.float()) for x in (colors, depth))
+        groups, drawn = _draw_ellipses(
+            xy, covariance, opacity, colors, depth, (height, width), background, preset, keep
         )
-        order = depth_order(order[:m], keys[:m], np.uint32(lowest), np.uint32(highest))
-        groups = _Groups(height, width, colors.shape[1], background)
-        passes = [
-            _draw(True, pack_ellipses, (xy, covariance, opacity, colors, first, order), m, preset, bg,
-                  (height, width), keep, rgb, alpha)
-            for first, bg, rgb, alpha in groups.each()
-        ]  # fmt: skip
         if keep:
-            ctx.saved = passes, order, opacity, colors.shape[1]
+            ctx.drawn = drawn
         return groups.picture(), groups.alpha
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grad_outputs: Any) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        passes, order, opacity, channels = ctx.saved
-        n = len(opacity)
-        grads = np.zeros((n, 2)), np.zeros((n, 3)), np.zeros(n), np.zeros((n, channels), f32)
-        for k, (of, pull) in enumerate(zip(passes, _pulls(*grad_outputs), strict=True)):
-            slots = _draw_backward(of, *pull)
-            _run(ellipse_gradients, slots, order, of.slot_start, of.packed, opacity, k * CHANNELS, *grads)
-        as_given = [torch.from_numpy(g).to(dtype) for g, dtype in zip(grads, ctx.dtypes, strict=True)]
-        return *as_given, *[None] * 6
+        grads = ctx.drawn.gradients(*grad_outputs)
+        return *_tensors(grads, ctx.dtypes), *[None] * 6
 
 
 _composite_ellipses: Callable[..., tuple[Tensor, Tensor]] = _Ellipses.apply
+
+
+class _Gaussians(torch.autograd.Function):
+    """means [N, 3], shapes [N], [N, 3] or [N, 3, 3], quaternions [N, 4] or None, opacities [N], colors [N, C] ->
+    rgb [H, W, C], alpha [H, W]."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, means, shapes, quaternions, opacities, colors, camera, background, preset, keep, screen
+    ) -> Any:
+        n, size = len(means), (camera.height, camera.width)
+        ctx.like = [
+            None if x is None else (x.shape, x.dtype) for x in (means, shapes, quaternions, opacities, colors)
+        ]
+        turns = means.new_zeros(0, 4) if quaternions is None else quaternions
+        flat = shapes.reshape(n, 9 if shapes.ndim == 3 else 1 if shapes.ndim == 1 else 3)
+        world = tuple(_array(x.double()) for x in (means, flat, turns))
+        opacity, colors = _array(opacities.double()), _array(colors.float())
+        view = _view(camera, preset)
+        xy, covariance, depth = np.empty((n, 2)), np.empty((n, 3)), np.empty(n, f32)
+        _run(
+            project_gaussians,
+            *world,
+            opacity,
+            colors,
+            *view,
+            preset.low_pass,
+            f32(preset.near),
+            xy,
+            covariance,
+            depth,
+        )
+        groups, drawn = _draw_ellipses(xy, covariance, opacity, colors, depth, size, background, preset, keep)
+        if screen is not None:
+            ellipses = Ellipses(*(torch.from_numpy(x) for x in (xy, covariance, opacity, depth, colors)))
+            screen.radius = radii(ellipses, *size, preset).to(means.dtype)
+        if keep:
+            ctx.saved = drawn, world, view, screen
+        return groups.picture(), groups.alpha
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grad_outputs: Any) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        drawn, world, view, screen = ctx.saved
+        grad_xy, grad_covariance, *of_splats = drawn.gradients(*grad_outputs)
+        of_world = tuple(np.zeros_like(x) for x in world)
+        _run(gaussian_gradients, grad_xy, grad_covariance, *world, *view, *of_world)
+        if screen is not None and ctx.needs_input_grad[0]:
+            screen.add(torch.from_numpy(grad_xy).to(ctx.like[0][1]))
+        grads = [
+            None if like is None else torch.from_numpy(g).reshape(like[0]).to(like[1])
+            for g, like in zip((*of_world, *of_splats), ctx.like, strict=True)
+        ]
+        return *grads, *[None] * 5
+
+
+def _view(camera: Camera, preset: Preset) -> tuple[NDArray[np.float64], ...]:
+    """K, R, t, K R, and the least and greatest slope x / z, y / z up to which the off-axis terms grow."""
+    K = intrinsics(camera)
+    low, high = clamped_directions(camera, preset)
+    R, t = (np.ascontiguousarray(x, np.float64) for x in (camera.R, camera.t))
+    return K, R, t, K @ R, low, high
+
+
+_composite_gaussians: Callable[..., tuple[Tensor, Tensor]] = _Gaussians.apply
 
 
 # ----------------------------------------------------------------------------------------------------

@@ -24,6 +24,14 @@ def intrinsics(camera: Camera) -> np.ndarray:
     return K
 
 
+def clamped_directions(camera: Camera, preset: Preset) -> tuple[np.ndarray, np.ndarray]:
+    """Least and greatest x / z, y / z in the image and `preset.clamp` of half its size around it."""
+    K, size = intrinsics(camera), np.array([camera.width, camera.height])
+    focal = np.diag(K)[:2]
+    beyond = preset.clamp * size / (2 * focal)
+    return -K[:2, 2] / focal - beyond, (size - K[:2, 2]) / focal + beyond
+
+
 def depths(means: Tensor, camera: Camera) -> Tensor:
     """[N] m, float64, along the camera's axis."""
     return means.double() @ _on(camera.R[2], means) + float(camera.t[2])
@@ -72,9 +80,7 @@ def project_ellipses(
     z = p[:, 2]
     direction = p[:, :2] / z[:, None]
     to_pixels, offset = _on(K[:2, :2].T, means), _on(K[:2, 2], means)
-    size, focal = np.array([camera.width, camera.height]), np.diag(K)[:2]
-    beyond = preset.clamp * size / (2 * focal)
-    low, high = _on(-K[:2, 2] / focal - beyond, means), _on((size - K[:2, 2]) / focal + beyond, means)
+    low, high = (_on(x, means) for x in clamped_directions(camera, preset))
     clamped = torch.addmm(offset, torch.minimum(torch.maximum(direction, low), high), to_pixels)
     R = _on(camera.R, means)
     derivative = (_on(K[:2, :2], means) @ R[:2] + offset[:, None] * R[2] - clamped[:, :, None] * R[2]) / z[
