@@ -191,6 +191,20 @@ def _store_where(typing, array, index, value, mask):
     return types.none(array, index, value, mask), code
 
 
+def _prefetch(typing, array, index):
+    """Begin to load array.flat[index] of a contiguous array into the cache; a loop that gathers waits less."""
+
+    def code(context, builder, signature, values):
+        data = context.make_array(signature.args[0])(context, builder, values[0]).data
+        address = builder.bitcast(builder.gep(data, [values[1]]), ir.IntType(8).as_pointer())
+        kind = ir.FunctionType(ir.VoidType(), [address.type, _INT, _INT, _INT])
+        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+        builder.call(function, [address, ir.Constant(_INT, 0), ir.Constant(_INT, 3), ir.Constant(_INT, 1)])
+        return context.get_dummy_value()
+
+    return types.none(array, index), code
+
+
 def _address(context: Any, builder: Any, signature: Any, values: Any) -> Any:
     array = context.make_array(signature.args[0])(context, builder, values[0])
     return builder.bitcast(builder.gep(array.data, [values[1]]), _FLOATS.as_pointer())
@@ -199,6 +213,7 @@ def _address(context: Any, builder: Any, signature: Any, values: Any) -> Any:
 load: Any = intrinsic(_load)
 store: Any = intrinsic(_store)
 store_where: Any = intrinsic(_store_where)
+prefetch: Any = intrinsic(_prefetch)
 lanes = _intrinsic(0, f32x16, _lane_numbers)  # 0, 1, … 15
 zeros = _intrinsic(0, f32x16, lambda builder: _constant(0))
 broadcast = _intrinsic(1, f32x16, _broadcast)  # a float32 in every lane

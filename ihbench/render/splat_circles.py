@@ -11,7 +11,16 @@ import numpy as np
 from numba import njit
 
 from ihbench.render.lanes import exp2, lanes, store, zeros
-from ihbench.render.splat_tiles import TILE_HEIGHT, TILE_WIDTH, close_tiles, count_tiles, f32, u64
+from ihbench.render.splat_tiles import (
+    TILE_HEIGHT,
+    TILE_WIDTH,
+    close_tiles,
+    count_tiles,
+    f32,
+    fetch_record,
+    fetch_slots,
+    u64,
+)
 
 CIRCLE = 8  # floats of a packed circle: x, y, sharpness, reach, colour, padding
 CIRCLE_GRADIENT = 8  # floats of a slot: sums over dx, dy, d², colour, padding
@@ -26,65 +35,71 @@ ZERO, ONE = f32(0), f32(1)
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
 def project_circles(
     means, scales, colors, to_pixels, offset, focal2, low_pass, near, log_cut, height, width,
-    xy, variance, depth, order, keys,
+    records, depth, radius, part, parts,
 ):  # fmt: skip
-    """World Gaussians -> xy [N, 2], variance [N], depth [N] float32; which can reach a pixel, and their keys.
+    """World Gaussians -> one part of `records` [N, CIRCLE], depth [N] float32, and the radius where asked for, [N].
 
-    Returns how many those are and the range of their keys. Left out are those behind the near plane and those with a
-    value that is not finite in float32; their variance is 0.
+    A depth of 0 marks what is not drawn: what is out of sight, behind the near plane, or has a value that is not
+    finite in float32. Sharpness s is such that alpha = 2^-(s d)²: the exponent of a huge circle far outside the image
+    cannot overflow.
     """
-    R, t = to_pixels, offset
-    m, lowest, highest = 0, np.uint32(0xFFFFFFFF), np.uint32(0)
-    bits = depth.view(np.uint32)
-    for i in range(len(means)):
+    R, t, n = to_pixels, offset, len(means)
+    for i in range(n * part // parts, n * (part + 1) // parts):
         X, Y, Z = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
         z = R[2, 0] * X + R[2, 1] * Y + R[2, 2] * Z + t[2]
         inverse = 1.0 / z
         s = np.float64(scales[i]) * inverse
         x = f32((R[0, 0] * X + R[0, 1] * Y + R[0, 2] * Z + t[0]) * inverse)
         y = f32((R[1, 0] * X + R[1, 1] * Y + R[1, 2] * Z + t[1]) * inverse)
-        v = f32(s * s * focal2 + low_pass)
-        xy[i, 0], xy[i, 1], variance[i], depth[i] = x, y, v, z
-        bad = x - x + (y - y) + (v - v) + (depth[i] - depth[i])  # NaN where one is not finite
+        v, distance = f32(s * s * focal2 + low_pass), f32(z)
+        bad = x - x + (y - y) + (v - v) + (distance - distance)  # NaN where one is not finite
         for c in range(colors.shape[1]):
             bad += colors[i, c] - colors[i, c]
-        if not (bad == ZERO and depth[i] > near):
-            variance[i] = ZERO
+        depth[i] = ZERO
+        if not (bad == ZERO and distance > near):
             continue
         dx = max(0.5 - np.float64(x), np.float64(x) - (width - 0.5), 0.0)
         dy = max(0.5 - np.float64(y), np.float64(y) - (height - 0.5), 0.0)
-        key = bits[i]
-        order[m] = i
-        keys[m] = key
-        if dx * dx + dy * dy <= v * log_cut:
-            m += 1
-            lowest, highest = min(lowest, key), max(highest, key)
-    return m, lowest, highest
+        cut = v * log_cut
+        if len(radius) and dx * dx <= cut and dy * dy <= cut:
+            radius[i] = math.sqrt(cut)
+        if dx * dx + dy * dy > cut:
+            continue
+        depth[i] = distance
+        # rounding of the reach must not lose a pixel: the alpha threshold decides in the end
+        reach = f32(math.sqrt(cut)) * f32(1.00005)
+        p = records[i]
+        p[0], p[1], p[2], p[3] = x, y, math.sqrt(f32(HALF_LOG2_E) / v), reach
+        for c in range(min(colors.shape[1], 3)):
+            p[CIRCLE_COLOR + c] = colors[i, c]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
 def pack_circles(
-    xy, variance, colors, first, order, log_cut, alpha_min, alpha_max, t_stop, height, width,
-    packed, boxes, counts, closed, let_through, slot_start,
-):  # fmt: skip
-    """Fill `packed` [M, CIRCLE] in depth order and what `splat_tiles` wants; returns the number of entries.
-
-    `packed` comes with colours of 0; they are channel `first` and the two after it. Sharpness s is such that
-    alpha = 2^-(s d)²: the exponent of a huge circle far outside the image cannot overflow.
-    """
+    records,
+    order,
+    alpha_min,
+    alpha_max,
+    t_stop,
+    height,
+    width,
+    packed,
+    boxes,
+    counts,
+    closed,
+    let_through,
+    slot_start,
+):
+    """Fill `packed` [M, CIRCLE] in depth order and what `splat_tiles` wants; returns the number of entries."""
     entries = 0
-    channels = min(colors.shape[1] - first, 3)
     for rank in range(len(order)):
+        fetch_record(records, order, rank)
         i, p = u64(order[rank]), packed[u64(rank)]
-        v = variance[i]
-        # rounding of the reach must not lose a pixel: the alpha threshold decides in the end
-        reach = f32(math.sqrt(v * log_cut)) * f32(1.00005)
-        p[0], p[1], p[2], p[3] = xy[i, 0], xy[i, 1], math.sqrt(f32(HALF_LOG2_E) / v), reach
-        for c in range(channels):
-            p[CIRCLE_COLOR + c] = colors[i, first + c]
-        slot_start[rank] = entries
-        entries += count_tiles(rank, p[0], p[1], reach, reach, height, width, boxes, counts, closed)
-        if reach > f32(TILE_WIDTH):  # a smaller circle hides no tile
+        for c in range(u64(CIRCLE)):
+            p[c] = records[i, c]
+        slot_start[u64(rank)] = entries
+        entries += count_tiles(rank, p[0], p[1], p[3], p[3], height, width, boxes, counts, closed)
+        if p[3] > f32(TILE_WIDTH):  # a smaller circle hides no tile
             close_tiles(
                 rank, p[0], p[1], ZERO, p[2], p[2], ZERO, alpha_min, alpha_max, t_stop, width, boxes, let_through,
                 closed,
@@ -133,36 +148,39 @@ def circle_segments(packed, rank, position, x0, y0, dead, test, prepared, segmen
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
 def circle_gradients(
-    slots, order, slot_start, xy, variance, depth, scales, to_pixels, focal2, first,
+    slots, rank_of, slot_start, packed, depth, scales, to_pixels, focal2, first, last,
     grad_means, grad_scales, grad_colors, grad_xy, part, parts,
 ):  # fmt: skip
-    """Slots -> one part of the gradients of means [N, 3], scales [N], colors [N, C], through the projection, and
-    where grad_xy [N, 2] is not empty of the centres.
-
-    Adds to all but the colours, for each group of three channels that is drawn adds its own.
-    """
-    R, m = to_pixels, len(order)
+    """Slots -> one part of the gradient of colors [N, C] from channel `first` on, and with `last` of means [N, 3] and
+    scales [N], for which the slots have been added up over all channels; of the centres [N, 2] px where grad_xy is
+    not empty."""
+    R, n = to_pixels, len(rank_of)
     channels = min(grad_colors.shape[1] - first, 3)
-    for rank in range(m * part // parts, m * (part + 1) // parts):
-        i = u64(order[rank])
+    for i in range(n * part // parts, n * (part + 1) // parts):
+        fetch_slots(slots, rank_of, slot_start, packed, i)
+        if rank_of[i] < 0:
+            continue
+        rank = u64(rank_of[i])
         sx = sy = sd = r = g = b = 0.0
-        for k in range(slot_start[rank], slot_start[rank + 1]):
-            e = slots[k]
+        for k in range(slot_start[rank], slot_start[rank + u64(1)]):
+            e = slots[u64(k)]
             sx, sy, sd = sx + e[0], sy + e[1], sd + e[2]
             r, g, b = r + e[3], g + e[4], b + e[5]
-        v, inverse, s = np.float64(variance[i]), 1.0 / np.float64(depth[i]), np.float64(scales[i])
-        gx, gy = sx / v, sy / v  # along the centre
-        gs = focal2 * s * inverse * inverse * (sd / v / v)  # along the scale
-        grad_scales[i] += gs
-        if len(grad_xy):
-            grad_xy[i, 0] += gx
-            grad_xy[i, 1] += gy
-        px, py = gx * inverse, gy * inverse
-        pz = -(gx * xy[i, 0] + gy * xy[i, 1] + gs * s) * inverse
-        for c in range(3):
-            grad_means[i, c] += R[0, c] * px + R[1, c] * py + R[2, c] * pz
         grad_colors[i, first] = r
         if channels > 1:
             grad_colors[i, first + 1] = g
         if channels > 2:
             grad_colors[i, first + 2] = b
+        if not last:
+            continue
+        sharp, inverse, s = np.float64(packed[rank, 2]), 1.0 / np.float64(depth[i]), np.float64(scales[i])
+        per_variance = sharp * sharp / HALF_LOG2_E
+        gx, gy = sx * per_variance, sy * per_variance  # along the centre
+        gs = focal2 * s * inverse * inverse * (sd * per_variance * per_variance)  # along the scale
+        grad_scales[i] = gs
+        if len(grad_xy):
+            grad_xy[i, 0], grad_xy[i, 1] = gx, gy
+        px, py = gx * inverse, gy * inverse
+        pz = -(gx * packed[rank, 0] + gy * packed[rank, 1] + gs * s) * inverse
+        for c in range(3):
+            grad_means[i, c] = R[0, c] * px + R[1, c] * py + R[2, c] * pz

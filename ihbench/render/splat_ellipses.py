@@ -27,7 +27,16 @@ from ihbench.render.lanes import (
     zeros,
 )
 from ihbench.render.splat_circles import SEGMENT, hidden
-from ihbench.render.splat_tiles import TILE_HEIGHT, TILE_WIDTH, close_tiles, count_tiles, f32, u64
+from ihbench.render.splat_tiles import (
+    TILE_HEIGHT,
+    TILE_WIDTH,
+    close_tiles,
+    count_tiles,
+    f32,
+    fetch_record,
+    fetch_slots,
+    u64,
+)
 
 # floats of a packed ellipse: x, y, sharpness across a row and down, shear, log2 opacity, level (the exponent where
 # alpha ends), half width, half height, colour, padding
@@ -42,57 +51,69 @@ FARTHEST = 1e18  # px; a reach that float32 can square
 ZERO, ONE = f32(0), f32(1)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def visible_ellipses(xy, covariance, opacity, depth, alpha_min, height, width, order, keys):
-    """The splats whose footprint's box can hold a pixel centre, and the bits of their depth; how many, and the range.
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def ellipse_record(record, x, y, xx, both, yy, opacity, alpha_min, height, width):
+    """Fill all but the colour of `record` [ELLIPSE]; returns whether the ellipse can reach a pixel.
 
-    Left out are those with an opacity under `alpha_min`, and where the covariance has no inverse.
+    It cannot with an opacity under `alpha_min`, without an inverse covariance, or where no pixel centre lies in its
+    box.
     """
-    m, lowest, highest = 0, np.uint32(0xFFFFFFFF), np.uint32(0)
-    bits = depth.view(np.uint32)
-    for i in range(len(depth)):
-        order[m] = i
-        key = bits[i]
-        keys[m] = key
-        xx, both, yy = covariance[i, 0], covariance[i, 1], covariance[i, 2]
-        if not opacity[i] >= alpha_min or not xx * yy - both * both > 0:
-            continue
-        cut = 2 * math.log(opacity[i] / alpha_min) * 1.0001 + 1e-5
-        dx = max(0.5 - xy[i, 0], xy[i, 0] - (width - 0.5), 0.0)
-        dy = max(0.5 - xy[i, 1], xy[i, 1] - (height - 0.5), 0.0)
-        if dx * dx <= xx * cut and dy * dy <= yy * cut:
-            m += 1
-            lowest, highest = min(lowest, key), max(highest, key)
-    return m, lowest, highest
+    determinant = xx * yy - both * both
+    if not opacity >= alpha_min or not determinant > 0:
+        return False
+    log2_opacity = math.log2(opacity)
+    # rounding of the level must not lose a pixel: the alpha threshold decides in the end
+    level = max(log2_opacity - math.log2(alpha_min), 0.0) * 1.0001 + 1e-5
+    half_x, half_y = math.sqrt(level * LOG_4 * xx) * 1.00001, math.sqrt(level * LOG_4 * yy) * 1.00001
+    beside_x, beside_y = max(0.5 - x, x - (width - 0.5)), max(0.5 - y, y - (height - 0.5))
+    if beside_x > half_x or beside_y > half_y:
+        return False
+    record[0], record[1] = x, y
+    across = determinant / yy  # the variance within a row
+    record[2], record[3] = math.sqrt(HALF_LOG2_E / across), math.sqrt(HALF_LOG2_E / yy)
+    record[4], record[5], record[6] = both / yy, log2_opacity, level
+    record[7], record[8] = min(half_x, FARTHEST), min(half_y, FARTHEST)
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def ellipse_records(xy, covariance, opacity, colors, alpha_min, height, width, records, depth, part, parts):
+    """Fill one part of `records` [N, ELLIPSE] from projected ellipses; the depth of those out of sight becomes 0."""
+    n, channels = len(xy), min(colors.shape[1], 3)
+    for i in range(n * part // parts, n * (part + 1) // parts):
+        if not ellipse_record(
+            records[i], xy[i, 0], xy[i, 1], covariance[i, 0], covariance[i, 1], covariance[i, 2], opacity[i],
+            alpha_min, height, width,
+        ):  # fmt: skip
+            depth[i] = ZERO
+        for c in range(channels):
+            records[i, ELLIPSE_COLOR + c] = colors[i, c]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def pack_ellipses(
-    xy, covariance, opacity, colors, first, order, alpha_min, alpha_max, t_stop, height, width,
-    packed, boxes, counts, closed, let_through, slot_start,
-):  # fmt: skip
-    """Fill `packed` [M, ELLIPSE] in depth order and what `splat_tiles` wants; returns the number of entries.
-
-    `packed` comes with colours of 0; they are channel `first` and the two after it.
-    """
+    records,
+    order,
+    alpha_min,
+    alpha_max,
+    t_stop,
+    height,
+    width,
+    packed,
+    boxes,
+    counts,
+    closed,
+    let_through,
+    slot_start,
+):
+    """Fill `packed` [M, ELLIPSE] in depth order and what `splat_tiles` wants; returns the number of entries."""
     entries = 0
-    channels = min(colors.shape[1] - first, 3)
-    log2_min = math.log2(alpha_min)
     for rank in range(len(order)):
+        fetch_record(records, order, rank)
         i, p = u64(order[rank]), packed[u64(rank)]
-        xx, both, yy = covariance[i, 0], covariance[i, 1], covariance[i, 2]
-        across = (xx * yy - both * both) / yy  # the variance within a row
-        log2_opacity = math.log2(opacity[i])
-        # rounding of the level must not lose a pixel: the alpha threshold decides in the end
-        level = max(log2_opacity - log2_min, 0.0) * 1.0001 + 1e-5
-        half_x, half_y = math.sqrt(level * LOG_4 * xx) * 1.00001, math.sqrt(level * LOG_4 * yy) * 1.00001
-        p[0], p[1] = xy[i, 0], xy[i, 1]
-        p[2], p[3] = math.sqrt(HALF_LOG2_E / across), math.sqrt(HALF_LOG2_E / yy)
-        p[4], p[5], p[6] = both / yy, log2_opacity, level
-        p[7], p[8] = min(half_x, FARTHEST), min(half_y, FARTHEST)
-        for c in range(channels):
-            p[ELLIPSE_COLOR + c] = colors[i, first + c]
-        slot_start[rank] = entries
+        for c in range(u64(ELLIPSE)):
+            p[c] = records[i, c]
+        slot_start[u64(rank)] = entries
         entries += count_tiles(rank, p[0], p[1], p[7], p[8], height, width, boxes, counts, closed)
         if p[7] > f32(TILE_WIDTH / 2) and p[8] > f32(TILE_HEIGHT / 2):  # a smaller ellipse hides no tile
             close_tiles(
@@ -142,38 +163,44 @@ def ellipse_segments(packed, rank, position, x0, y0, dead, test, prepared, segme
     return n if alive else before
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def ellipse_gradients(
-    slots, order, slot_start, packed, opacity, first, grad_xy, grad_covariance, grad_opacity, grad_colors, part, parts
-):
-    """Slots -> one part of the gradients of xy [N, 2], covariance [N, 3], opacity [N], colors [N, C]; added to all
-    but the last.
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def ellipse_sums(slots, begin, end, packed):
+    """A splat's slots -> gradients along its centre (x, y), covariance (xx, xy, yy) and ln opacity, and its colour.
 
     With K the inverse covariance and s the slope along ln alpha at a pixel d px away: sum(s) K d along the centre,
     sum(s) K d dᵀ K / 2 along the covariance, of which the off-diagonal entry stands for two.
     """
-    m = len(order)
-    channels = min(grad_colors.shape[1] - first, 3)
-    for rank in range(m * part // parts, m * (part + 1) // parts):
-        i = u64(order[rank])
-        s0 = st = su = stt = stu = suu = r = g = b = 0.0
-        for k in range(slot_start[rank], slot_start[rank + 1]):
-            e = slots[k]
-            s0, st, su = s0 + e[0], st + e[1], su + e[2]
-            stt, stu, suu = stt + e[3], stu + e[4], suu + e[5]
-            r, g, b = r + e[6], g + e[7], b + e[8]
-        # (t, u) = (sharp_x (dx - shear dy), sharp_y dy), and 2 ln 2 sharp² is one over the variance
-        across, down, shear = LOG_4 * packed[rank, 2], LOG_4 * packed[rank, 3], np.float64(packed[rank, 4])
-        gx = across * st
-        grad_xy[i, 0] += gx
-        grad_xy[i, 1] += down * su - shear * gx
-        xx, xy, yy = across * across * stt / 2, across * down * stu / 2, down * down * suu / 2
-        grad_covariance[i, 0] += xx
-        grad_covariance[i, 1] += 2 * (xy - shear * xx)
-        grad_covariance[i, 2] += yy - 2 * shear * xy + shear * shear * xx
-        grad_opacity[i] += s0 / opacity[i]
-        grad_colors[i, first] = r
-        if channels > 1:
-            grad_colors[i, first + 1] = g
-        if channels > 2:
-            grad_colors[i, first + 2] = b
+    s0 = st = su = stt = stu = suu = r = g = b = 0.0
+    for k in range(begin, end):
+        e = slots[u64(k)]
+        s0, st, su = s0 + e[0], st + e[1], su + e[2]
+        stt, stu, suu = stt + e[3], stu + e[4], suu + e[5]
+        r, g, b = r + e[6], g + e[7], b + e[8]
+    # (t, u) = (sharp_x (dx - shear dy), sharp_y dy), and 2 ln 2 sharp² is one over the variance
+    across, down, shear = LOG_4 * packed[2], LOG_4 * packed[3], np.float64(packed[4])
+    x = across * st
+    xx, xy, yy = across * across * stt / 2, across * down * stu / 2, down * down * suu / 2
+    covariance = xx, 2 * (xy - shear * xx), yy - 2 * shear * xy + shear * shear * xx
+    return (x, down * su - shear * x), covariance, s0, (r, g, b)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def ellipse_gradients(
+    slots, rank_of, slot_start, packed, opacity, first, last, grad_xy, grad_covariance, grad_opacity, grad_colors,
+    part, parts,
+):  # fmt: skip
+    """Slots -> one part of the gradient of colors [N, C] from channel `first` on, and with `last` of xy [N, 2],
+    covariance [N, 3] and opacity [N], for which the slots have been added up over all channels."""
+    n, channels = len(rank_of), min(grad_colors.shape[1] - first, 3)
+    for i in range(n * part // parts, n * (part + 1) // parts):
+        fetch_slots(slots, rank_of, slot_start, packed, i)
+        if rank_of[i] < 0:
+            continue
+        rank = u64(rank_of[i])
+        center, covariance, s0, color = ellipse_sums(slots, slot_start[rank], slot_start[rank + u64(1)], packed[rank])
+        for c in range(channels):
+            grad_colors[i, first + c] = color[c]
+        if last:
+            grad_xy[i, 0], grad_xy[i, 1] = center
+            grad_covariance[i, 0], grad_covariance[i, 1], grad_covariance[i, 2] = covariance
+            grad_opacity[i] = s0 / opacity[i]

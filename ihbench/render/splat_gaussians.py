@@ -14,19 +14,22 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba import njit
 
-from ihbench.render.splat_tiles import f32
+from ihbench.render.splat_ellipses import ELLIPSE_COLOR, ellipse_record, ellipse_sums
+from ihbench.render.splat_tiles import f32, fetch_slots, u64
 
 SHORTEST = 1e-12  # a quaternion shorter than this is divided by it, as torch's normalize does
 ZERO = f32(0)
+_FAST = {"contract", "nsz", "arcp"}
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST, forceinline=True)
 def _derivative(means, i, K, R, t, A, low, high):
     """Camera-space direction (x, y) and depth of centre i, whether the direction is inside the clamp (per axis), and
     the rows D_0, D_1 of the derivative of its pixel along the world. A is K R."""
-    X, Y, Z = means[i, 0], means[i, 1], means[i, 2]
+    X, Y, Z = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
     z = R[2, 0] * X + R[2, 1] * Y + R[2, 2] * Z + t[2]
     inverse = 1.0 / z
     x = (R[0, 0] * X + R[0, 1] * Y + R[0, 2] * Z + t[0]) * inverse
@@ -39,105 +42,134 @@ def _derivative(means, i, K, R, t, A, low, high):
     return x, y, z, clamped_x == x, clamped_y == y, d0, d1
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST, forceinline=True)
 def _axes(turns, i):
     """Quaternion i (w, x, y, z) made a unit one, its length, and the columns of its rotation: the Gaussian's axes."""
-    w, x, y, z = turns[i, 0], turns[i, 1], turns[i, 2], turns[i, 3]
+    w, x, y, z = np.float64(turns[i, 0]), np.float64(turns[i, 1]), np.float64(turns[i, 2]), np.float64(turns[i, 3])
     length = math.sqrt(w * w + x * x + y * y + z * z)
     inverse = 1.0 / max(length, SHORTEST)
     w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
-    first = 1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)
-    second = 2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)
-    third = 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
-    return (w, x, y, z), length, first, second, third
+    axis_x = 1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)
+    axis_y = 2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)
+    axis_z = 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
+    return (w, x, y, z), length, axis_x, axis_y, axis_z
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST, forceinline=True)
 def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST, forceinline=True)
 def _blend(p, a, q, b):
     return p * a[0] + q * b[0], p * a[1] + q * b[1], p * a[2] + q * b[2]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST, forceinline=True)
 def _times(shapes, i, d):
     """The symmetric half of the covariance in row i of `shapes` [N, 9], times d."""
-    xy, xz = (shapes[i, 1] + shapes[i, 3]) / 2, (shapes[i, 2] + shapes[i, 6]) / 2
-    yz = (shapes[i, 5] + shapes[i, 7]) / 2
+    xx, yy, zz = np.float64(shapes[i, 0]), np.float64(shapes[i, 4]), np.float64(shapes[i, 8])
+    xy, xz = (np.float64(shapes[i, 1]) + shapes[i, 3]) / 2, (np.float64(shapes[i, 2]) + shapes[i, 6]) / 2
+    yz = (np.float64(shapes[i, 5]) + shapes[i, 7]) / 2
     return (
-        shapes[i, 0] * d[0] + xy * d[1] + xz * d[2],
-        xy * d[0] + shapes[i, 4] * d[1] + yz * d[2],
-        xz * d[0] + yz * d[1] + shapes[i, 8] * d[2],
+        xx * d[0] + xy * d[1] + xz * d[2],
+        xy * d[0] + yy * d[1] + yz * d[2],
+        xz * d[0] + yz * d[1] + zz * d[2],
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
 def project_gaussians(
-    means, shapes, turns, opacity, colors, K, R, t, A, low, high, low_pass, near, xy, covariance, depth, part, parts
-):
-    """World Gaussians -> one part of xy [N, 2], covariance [N, 3] px², depth [N] float32.
+    means, shapes, turns, opacity, colors, K, R, t, A, low, high, low_pass, near, alpha_min, height, width,
+    records, depth, radius, part, parts,
+):  # fmt: skip
+    """World Gaussians -> one part of `records` [N, ELLIPSE], depth [N] float32, and the radius where asked for, [N].
 
     `shapes` is [N, 1] standard deviations of spheres, [N, 3] along the axes that `turns` [N, 4] turn to, or [N, 9]
-    covariances. What cannot be drawn gets a covariance of 0: what is behind the near plane, not finite in float32, or
-    no ellipse.
+    covariances. A depth of 0 marks what is not drawn: what is out of sight, behind the near plane, not finite in
+    float32, or no ellipse.
     """
     n, kind = len(means), shapes.shape[1]
     for i in range(n * part // parts, n * (part + 1) // parts):
         x, y, z, _, _, d0, d1 = _derivative(means, i, K, R, t, A, low, high)
         if kind == 1:
-            s = shapes[i, 0] * shapes[i, 0]
+            s = np.float64(shapes[i, 0]) ** 2
             xx, both, yy = s * _dot(d0, d0), s * _dot(d0, d1), s * _dot(d1, d1)
         elif kind == 3:
-            _, _, first, second, third = _axes(turns, i)
-            sx, sy, sz = shapes[i, 0], shapes[i, 1], shapes[i, 2]
-            b0 = _dot(d0, first) * sx, _dot(d0, second) * sy, _dot(d0, third) * sz
-            b1 = _dot(d1, first) * sx, _dot(d1, second) * sy, _dot(d1, third) * sz
+            _, _, axis_x, axis_y, axis_z = _axes(turns, i)
+            sx, sy, sz = np.float64(shapes[i, 0]), np.float64(shapes[i, 1]), np.float64(shapes[i, 2])
+            b0 = _dot(d0, axis_x) * sx, _dot(d0, axis_y) * sy, _dot(d0, axis_z) * sz
+            b1 = _dot(d1, axis_x) * sx, _dot(d1, axis_y) * sy, _dot(d1, axis_z) * sz
             xx, both, yy = _dot(b0, b0), _dot(b0, b1), _dot(b1, b1)
         else:
             e0, e1 = _times(shapes, i, d0), _times(shapes, i, d1)
             xx, both, yy = _dot(d0, e0), _dot(d0, e1), _dot(d1, e1)
         xx, yy = xx + low_pass, yy + low_pass
         u, v = K[0, 0] * x + K[0, 1] * y + K[0, 2], K[1, 1] * y + K[1, 2]
-        xy[i, 0], xy[i, 1], depth[i] = u, v, z
-        bad = f32(opacity[i]) * ZERO + f32(u) * ZERO + f32(v) * ZERO + depth[i] * ZERO  # NaN where one is not finite
+        distance = f32(z)
+        bad = f32(opacity[i]) * ZERO + f32(u) * ZERO + f32(v) * ZERO + distance * ZERO  # NaN where one is not finite
         bad += f32(xx) * ZERO + f32(both) * ZERO + f32(yy) * ZERO
         for c in range(colors.shape[1]):
             bad += colors[i, c] * ZERO
-        if bad == ZERO and depth[i] > near and xx * yy - both * both > 0:
-            covariance[i, 0], covariance[i, 1], covariance[i, 2] = xx, both, yy
-        else:
-            covariance[i, 0] = covariance[i, 1] = covariance[i, 2] = 0.0
+        depth[i] = ZERO
+        if bad == ZERO and distance > near:
+            o = np.float64(opacity[i])
+            if ellipse_record(records[i], u, v, xx, both, yy, o, alpha_min, height, width):
+                depth[i] = distance
+                if len(radius):
+                    radius[i] = _radius(u, v, xx, both, yy, o, alpha_min, height, width)
+            for c in range(min(colors.shape[1], 3)):
+                records[i, ELLIPSE_COLOR + c] = colors[i, c]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+def _radius(x, y, xx, both, yy, opacity, alpha_min, height, width):
+    """`splat_projection.radii` for one ellipse."""
+    cut = 2 * math.log(opacity / alpha_min)
+    beside_x, beside_y = max(0.5 - x, x - (width - 0.5), 0.0), max(0.5 - y, y - (height - 0.5), 0.0)
+    if beside_x * beside_x > xx * cut or beside_y * beside_y > yy * cut:
+        return 0.0
+    half = (xx - yy) / 2
+    return math.sqrt(cut * ((xx + yy) / 2 + math.sqrt(half * half + both * both)))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
 def gaussian_gradients(
-    grad_xy, grad_covariance, means, shapes, turns, K, R, t, A, low, high, grad_means, grad_shapes, grad_turns,
-    part, parts,
+    slots, rank_of, slot_start, packed, means, shapes, turns, opacity, K, R, t, A, low, high, first, last,
+    grad_means, grad_shapes, grad_turns, grad_opacity, grad_colors, grad_xy, part, parts,
 ):  # fmt: skip
-    """Gradients of xy [N, 2] and covariance [N, 3] -> one part of those of means, shapes and turns.
+    """Slots -> one part of the gradient of colors [N, C] from channel `first` on, and with `last` of all else, for
+    which the slots have been added up over all channels; of the centres [N, 2] px where grad_xy is not empty.
 
-    What nothing pulls keeps what it has.
+    What is not drawn keeps the gradient that it has.
     """
-    n, kind = len(means), shapes.shape[1]
+    n, kind, channels = len(means), shapes.shape[1], min(grad_colors.shape[1] - first, 3)
     for i in range(n * part // parts, n * (part + 1) // parts):
-        gu, gv = grad_xy[i, 0], grad_xy[i, 1]
-        gxx, half, gyy = grad_covariance[i, 0], grad_covariance[i, 1] / 2, grad_covariance[i, 2]
-        if gu == 0 and gv == 0 and gxx == 0 and half == 0 and gyy == 0:
-            continue  # not drawn, or hidden
+        fetch_slots(slots, rank_of, slot_start, packed, i)
+        if rank_of[i] < 0:
+            continue
+        rank = u64(rank_of[i])
+        center, covariance, s0, color = ellipse_sums(slots, slot_start[rank], slot_start[rank + u64(1)], packed[rank])
+        for c in range(channels):
+            grad_colors[i, first + c] = color[c]
+        gu, gv = center
+        gxx, half, gyy = covariance[0], covariance[1] / 2, covariance[2]
+        if not last or (gu == 0 and gv == 0 and gxx == 0 and half == 0 and gyy == 0 and s0 == 0):
+            continue  # the second: hidden
+        if len(grad_xy):
+            grad_xy[i, 0], grad_xy[i, 1] = center
+        grad_opacity[i] = s0 / opacity[i]
         x, y, z, inside_x, inside_y, d0, d1 = _derivative(means, i, K, R, t, A, low, high)
         if kind == 1:
-            s = shapes[i, 0]
+            s = np.float64(shapes[i, 0])
             f0, f1 = _blend(gxx, d0, half, d1), _blend(half, d0, gyy, d1)
             grad_shapes[i, 0] = 2 * s * (_dot(f0, d0) + _dot(f1, d1))
             g0, g1 = _blend(2 * s * s, f0, 0.0, f0), _blend(2 * s * s, f1, 0.0, f1)
         elif kind == 3:
-            (qw, qx, qy, qz), length, first, second, third = _axes(turns, i)
-            sx, sy, sz = shapes[i, 0], shapes[i, 1], shapes[i, 2]
-            a0 = _dot(d0, first), _dot(d0, second), _dot(d0, third)
-            a1 = _dot(d1, first), _dot(d1, second), _dot(d1, third)
+            (qw, qx, qy, qz), length, axis_x, axis_y, axis_z = _axes(turns, i)
+            sx, sy, sz = np.float64(shapes[i, 0]), np.float64(shapes[i, 1]), np.float64(shapes[i, 2])
+            a0 = _dot(d0, axis_x), _dot(d0, axis_y), _dot(d0, axis_z)
+            a1 = _dot(d1, axis_x), _dot(d1, axis_y), _dot(d1, axis_z)
             b0, b1 = (a0[0] * sx, a0[1] * sy, a0[2] * sz), (a1[0] * sx, a1[1] * sy, a1[2] * sz)
             f0, f1 = _blend(2 * gxx, b0, 2 * half, b1), _blend(2 * half, b0, 2 * gyy, b1)
             grad_shapes[i, 0] = f0[0] * a0[0] + f1[0] * a1[0]
@@ -145,16 +177,16 @@ def gaussian_gradients(
             grad_shapes[i, 2] = f0[2] * a0[2] + f1[2] * a1[2]
             f0, f1 = (f0[0] * sx, f0[1] * sy, f0[2] * sz), (f1[0] * sx, f1[1] * sy, f1[2] * sz)
             g0 = (
-                f0[0] * first[0] + f0[1] * second[0] + f0[2] * third[0],
-                f0[0] * first[1] + f0[1] * second[1] + f0[2] * third[1],
-                f0[0] * first[2] + f0[1] * second[2] + f0[2] * third[2],
+                f0[0] * axis_x[0] + f0[1] * axis_y[0] + f0[2] * axis_z[0],
+                f0[0] * axis_x[1] + f0[1] * axis_y[1] + f0[2] * axis_z[1],
+                f0[0] * axis_x[2] + f0[1] * axis_y[2] + f0[2] * axis_z[2],
             )
             g1 = (
-                f1[0] * first[0] + f1[1] * second[0] + f1[2] * third[0],
-                f1[0] * first[1] + f1[1] * second[1] + f1[2] * third[1],
-                f1[0] * first[2] + f1[1] * second[2] + f1[2] * third[2],
+                f1[0] * axis_x[0] + f1[1] * axis_y[0] + f1[2] * axis_z[0],
+                f1[0] * axis_x[1] + f1[1] * axis_y[1] + f1[2] * axis_z[1],
+                f1[0] * axis_x[2] + f1[1] * axis_y[2] + f1[2] * axis_z[2],
             )
-            # along the first, second and third column of the rotation
+            # along the columns of the rotation
             p, q, r = (
                 _blend(f0[0], d0, f1[0], d1),
                 _blend(f0[1], d0, f1[1], d1),

@@ -36,17 +36,25 @@ from torch.autograd.function import once_differentiable
 
 from ihbench.camera import Camera
 from ihbench.render import lanes, splat_compositing, splat_plain
-from ihbench.render.splat_circles import CIRCLE, CIRCLE_GRADIENT, circle_gradients, pack_circles, project_circles
+from ihbench.render.splat_circles import (
+    CIRCLE,
+    CIRCLE_COLOR,
+    CIRCLE_GRADIENT,
+    circle_gradients,
+    pack_circles,
+    project_circles,
+)  # fmt: skip
 from ihbench.render.splat_ellipses import (
     ELLIPSE,
+    ELLIPSE_COLOR,
     ELLIPSE_GRADIENT,
     ellipse_gradients,
+    ellipse_records,
     pack_ellipses,
-    visible_ellipses,
 )  # fmt: skip
 from ihbench.render.splat_gaussians import gaussian_gradients, project_gaussians
-from ihbench.render.splat_projection import clamped_directions, intrinsics, radii
-from ihbench.render.splat_tiles import OPEN, TILE_HEIGHT, TILE_WIDTH, depth_order, fill_tiles
+from ihbench.render.splat_projection import clamped_directions, intrinsics
+from ihbench.render.splat_tiles import OPEN, TILE_HEIGHT, TILE_WIDTH, depth_order, fill_tiles, in_sight
 from ihbench.render.splats import PRESETS, Ellipses, Preset, Splats, as_ellipses
 
 if TYPE_CHECKING:
@@ -140,9 +148,8 @@ class _Pass:
 
 def _draw(
     elliptic: bool | None,
-    pack: Callable[..., int],
-    inputs: tuple[Any, ...],
-    count: int,
+    records: NDArray[np.float32],
+    order: NDArray[np.int32],
     preset: Preset,
     background: NDArray[np.float32],
     size: tuple[int, int],
@@ -150,11 +157,12 @@ def _draw(
     rgb: NDArray[np.float32],
     alpha: NDArray[np.float32],
 ) -> _Pass:
-    """Pack `count` splats in depth order, list them per tile, and draw the tiles into rgb [H, W, 3], alpha [H, W]."""
+    """Pack the splats of this order, list them per tile, and draw the tiles into rgb [H, W, 3], alpha [H, W]."""
     height, width = size
     tiles_x, tiles_y = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
     tiles = tiles_x * tiles_y
-    packed = np.zeros((count, ELLIPSE if elliptic else CIRCLE), f32)
+    count, pack = len(order), pack_ellipses if elliptic else pack_circles
+    packed = np.empty((count, records.shape[1]), f32)
     boxes, slot_start = np.empty((count, 4), np.int32), np.empty(count + 1, np.int32)
     tile_start, closed, let_through = (
         np.zeros(tiles + 1, np.int64),
@@ -162,7 +170,7 @@ def _draw(
         np.ones(tiles, f32),
     )
     limits = preset.alpha_min, preset.alpha_max, T_STOP, height, width
-    entries = pack(*inputs, *limits, packed, boxes, tile_start, closed, let_through, slot_start)
+    entries = pack(records, order, *limits, packed, boxes, tile_start, closed, let_through, slot_start)
     if entries > np.iinfo(np.int32).max:
         raise MemoryError(f"splats: {entries} pairs of splat and tile, more than this back end can index")
     ranks, slots = np.empty(entries, np.int32), np.empty(entries, np.int32)
@@ -181,14 +189,58 @@ def _draw(
     )
 
 
-def _draw_backward(of: _Pass, grad_rgb: NDArray[np.float32], grad_alpha: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[entries, …] what each entry of each tile adds to the gradient of its splat."""
-    slots = np.zeros((len(of.slots), ELLIPSE_GRADIENT if of.elliptic else CIRCLE_GRADIENT), f32)
-    _run(
-        of.kernels.composite_tiles_backward, of.elliptic, of.packed, of.ranks, of.slots, of.tile_start, of.tile_order,
-        of.drawn, *of.size, *of.limits, of.background, grad_rgb, grad_alpha, of.state, slots,
-    )  # fmt: skip
-    return slots
+def _draw_all(
+    elliptic: bool | None,
+    records: NDArray[np.float32],
+    depth: NDArray[np.float32],
+    colors: NDArray[np.float32],
+    size: tuple[int, int],
+    background: Tensor,
+    preset: Preset,
+    keep: bool,
+) -> tuple[_Groups, _Drawn]:
+    """Splats with a depth > 0, whose `records` have the first three colours, in every channel."""
+    n, channels = colors.shape
+    order, keys = np.empty(n, np.int32), np.empty(n, np.uint32)
+    m, lowest, highest = in_sight(depth, order, keys)
+    order = depth_order(order[:m], keys[:m], np.uint32(lowest), np.uint32(highest))
+    groups, passes = _Groups(*size, channels, background), []
+    at = ELLIPSE_COLOR if elliptic else CIRCLE_COLOR
+    for first, bg, rgb, alpha in groups.each():
+        if first:
+            here = colors[:, first : first + CHANNELS]
+            records[:, at : at + CHANNELS] = 0
+            records[:, at : at + here.shape[1]] = here
+        passes.append(_draw(elliptic, records, order, preset, bg, size, keep, rgb, alpha))
+    rank_of = np.full(n if keep else 0, -1, np.int32)
+    if keep:
+        rank_of[order] = np.arange(m, dtype=np.int32)
+    return groups, _Drawn(passes, rank_of, channels)
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """A picture's passes, and what their backward pass needs."""
+
+    passes: list[_Pass]
+    rank_of: NDArray[np.int32]  # [N] a splat's place in depth, -1 where it is not drawn
+    channels: int
+
+    def backward(self, pulls: tuple[Tensor, Tensor], kernel: Callable[..., None], inputs: Any, grads: Any) -> None:
+        """Add up the slots of every pass, and let kernel(slots, …, *inputs, first channel, last, *grads) make
+        gradients of them: of three channels' colours each time, of all else the last time."""
+        elliptic = self.passes[0].elliptic
+        # the same in every pass, since the footprints are
+        slots = np.zeros((len(self.passes[0].slots), ELLIPSE_GRADIENT if elliptic else CIRCLE_GRADIENT), f32)
+        for k, (of, (grad_rgb, grad_alpha)) in enumerate(zip(self.passes, _pulls(*pulls), strict=True)):
+            if k:
+                slots[:, 6 if elliptic else 3 :] = 0  # another three colours
+            _run(
+                of.kernels.composite_tiles_backward, elliptic, of.packed, of.ranks, of.slots, of.tile_start,
+                of.tile_order, of.drawn, *of.size, *of.limits, of.background, grad_rgb, grad_alpha, of.state, slots,
+            )  # fmt: skip
+            last = k == len(self.passes) - 1
+            _run(kernel, slots, self.rank_of, of.slot_start, of.packed, *inputs, k * CHANNELS, last, *grads)
 
 
 class _Groups:
@@ -253,40 +305,28 @@ class _Circles(torch.autograd.Function):
         to_pixels, offset, focal2 = K @ camera.R, K @ camera.t, K[0, 0] * K[1, 1]
         ctx.dtypes = means.dtype, scales.dtype, colors.dtype
         means, scales, colors = _array(means), _array(scales), _array(colors.float())
-        log_cut = -2 * log(preset.alpha_min)
-        xy, variance, depth = np.empty((n, 2), f32), np.empty(n, f32), np.empty(n, f32)
-        order, keys = np.empty(n + 1, np.int32), np.empty(n + 1, np.uint32)
-        m, lowest, highest = project_circles(
-            means, scales, colors, to_pixels, offset, focal2, preset.low_pass, f32(preset.near), log_cut, height,
-            width, xy, variance, depth, order, keys,
+        records, depth = np.zeros((n, CIRCLE), f32), np.empty(n, f32)
+        radius = np.zeros(0 if screen is None else n)
+        _run(
+            project_circles, means, scales, colors, to_pixels, offset, focal2, preset.low_pass, f32(preset.near),
+            f32(-2 * log(preset.alpha_min)), height, width, records, depth, radius,
         )  # fmt: skip
-        order = depth_order(order[:m], keys[:m], np.uint32(lowest), np.uint32(highest))
-        groups = _Groups(height, width, colors.shape[1], background)
-        passes = [
-            _draw(None, pack_circles, (xy, variance, colors, first, order, f32(log_cut)), m, preset, bg,
-                  (height, width), keep, rgb, alpha)
-            for first, bg, rgb, alpha in groups.each()
-        ]  # fmt: skip
+        groups, drawn = _draw_all(None, records, depth, colors, (height, width), background, preset, keep)
         if screen is not None:
-            circles = (torch.from_numpy(x) for x in (xy, variance, depth, colors))
-            screen.radius = radii(as_ellipses(Splats(*circles)), height, width, preset).to(ctx.dtypes[0])
+            screen.radius = torch.from_numpy(radius).to(ctx.dtypes[0])
         if keep:
-            ctx.saved = passes, order, xy, variance, depth, scales, to_pixels, focal2, colors.shape[1], screen
+            ctx.saved = drawn, depth, scales, to_pixels, focal2, screen
         return groups.picture(), groups.alpha
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grad_outputs: Any) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        passes, order, xy, variance, depth, scales, to_pixels, focal2, channels, screen = ctx.saved
+        drawn, depth, scales, to_pixels, focal2, screen = ctx.saved
         n = len(scales)
-        grads = np.zeros((n, 3), scales.dtype), np.zeros(n, scales.dtype), np.zeros((n, channels), f32)
+        grads = np.zeros((n, 3), scales.dtype), np.zeros(n, scales.dtype), np.zeros((n, drawn.channels), f32)
         grad_xy = np.zeros((0 if screen is None else n, 2), scales.dtype)
-        for k, (of, pull) in enumerate(zip(passes, _pulls(*grad_outputs), strict=True)):
-            slots = _draw_backward(of, *pull)
-            _run(
-                circle_gradients, slots, order, of.slot_start, xy, variance, depth, scales, to_pixels, focal2,
-                k * CHANNELS, *grads, grad_xy,
-            )  # fmt: skip
+        inputs = depth, scales, to_pixels, focal2
+        drawn.backward(grad_outputs, circle_gradients, inputs, (*grads, grad_xy))
         if screen is not None and ctx.needs_input_grad[0]:
             screen.add(torch.from_numpy(grad_xy).to(ctx.dtypes[0]))
         return *_tensors(grads, ctx.dtypes), *[None] * 5
@@ -299,49 +339,6 @@ _composite_circles: Callable[..., tuple[Tensor, Tensor]] = _Circles.apply
 # Ellipses
 
 
-@dataclass(frozen=True)
-class _Drawn:
-    """Ellipses of a picture, and what its backward pass needs."""
-
-    passes: list[_Pass]
-    order: NDArray[np.int32]  # [M] indices of what is drawn, by depth
-    opacity: NDArray[np.float64]  # [N]
-    channels: int
-
-    def gradients(self, grad_rgb: Tensor, grad_alpha: Tensor) -> tuple[NDArray[Any], ...]:
-        """Of xy [N, 2], covariance [N, 3], opacity [N] and colors [N, C]."""
-        n = len(self.opacity)
-        grads = np.zeros((n, 2)), np.zeros((n, 3)), np.zeros(n), np.zeros((n, self.channels), f32)
-        for k, (of, pull) in enumerate(zip(self.passes, _pulls(grad_rgb, grad_alpha), strict=True)):
-            slots = _draw_backward(of, *pull)
-            _run(ellipse_gradients, slots, self.order, of.slot_start, of.packed, self.opacity, k * CHANNELS, *grads)
-        return grads
-
-
-def _draw_ellipses(
-    xy: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-    opacity: NDArray[np.float64],
-    colors: NDArray[np.float32],
-    depth: NDArray[np.float32],
-    size: tuple[int, int],
-    background: Tensor,
-    preset: Preset,
-    keep: bool,
-) -> tuple[_Groups, _Drawn]:
-    n = len(xy)
-    order, keys = np.empty(n + 1, np.int32), np.empty(n + 1, np.uint32)
-    m, lowest, highest = visible_ellipses(xy, covariance, opacity, depth, preset.alpha_min, *size, order, keys)
-    order = depth_order(order[:m], keys[:m], np.uint32(lowest), np.uint32(highest))
-    groups = _Groups(*size, colors.shape[1], background)
-    passes = [
-        _draw(True, pack_ellipses, (xy, covariance, opacity, colors, first, order), m, preset, bg, size, keep, rgb,
-              alpha)
-        for first, bg, rgb, alpha in groups.each()
-    ]  # fmt: skip
-    return groups, _Drawn(passes, order, opacity, colors.shape[1])
-
-
 class _Ellipses(torch.autograd.Function):
     """xy [M, 2], covariance [M, 3], opacity [M], colors [M, C], depth [M] -> rgb [H, W, C], alpha [H, W]."""
 
@@ -350,17 +347,20 @@ class _Ellipses(torch.autograd.Function):
         ctx.dtypes = xy.dtype, covariance.dtype, opacity.dtype, colors.dtype
         xy, covariance, opacity = (_array(x.double()) for x in (xy, covariance, opacity))
         colors, depth = (_array(x.float()) for x in (colors, depth))
-        groups, drawn = _draw_ellipses(
-            xy, covariance, opacity, colors, depth, (height, width), background, preset, keep
-        )
+        records, depth = np.zeros((len(xy), ELLIPSE), f32), depth.copy()
+        _run(ellipse_records, xy, covariance, opacity, colors, preset.alpha_min, height, width, records, depth)
+        groups, drawn = _draw_all(True, records, depth, colors, (height, width), background, preset, keep)
         if keep:
-            ctx.drawn = drawn
+            ctx.saved = drawn, opacity
         return groups.picture(), groups.alpha
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grad_outputs: Any) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        grads = ctx.drawn.gradients(*grad_outputs)
+        drawn, opacity = ctx.saved
+        n = len(opacity)
+        grads = np.zeros((n, 2)), np.zeros((n, 3)), np.zeros(n), np.zeros((n, drawn.channels), f32)
+        drawn.backward(grad_outputs, ellipse_gradients, (opacity,), grads)
         return *_tensors(grads, ctx.dtypes), *[None] * 6
 
 
@@ -381,26 +381,20 @@ class _Gaussians(torch.autograd.Function):
         ]
         turns = means.new_zeros(0, 4) if quaternions is None else quaternions
         flat = shapes.reshape(n, 9 if shapes.ndim == 3 else 1 if shapes.ndim == 1 else 3)
-        world = tuple(_array(x.double()) for x in (means, flat, turns))
-        opacity, colors = _array(opacities.double()), _array(colors.float())
-        view = _view(camera, preset)
-        xy, covariance, depth = np.empty((n, 2)), np.empty((n, 3)), np.empty(n, f32)
+        inputs = means, flat, turns, opacities
+        # one dtype, so that numba compiles two variants and no more
+        double = any(x.dtype == torch.float64 for x in inputs)
+        world = tuple(_array(x.double() if double else x.float()) for x in inputs)
+        colors, view = _array(colors.float()), _view(camera, preset)
+        records, depth = np.zeros((n, ELLIPSE), f32), np.empty(n, f32)
+        radius = np.zeros(0 if screen is None else n)
         _run(
-            project_gaussians,
-            *world,
-            opacity,
-            colors,
-            *view,
-            preset.low_pass,
-            f32(preset.near),
-            xy,
-            covariance,
-            depth,
-        )
-        groups, drawn = _draw_ellipses(xy, covariance, opacity, colors, depth, size, background, preset, keep)
+            project_gaussians, *world, colors, *view, preset.low_pass, f32(preset.near), preset.alpha_min, *size,
+            records, depth, radius,
+        )  # fmt: skip
+        groups, drawn = _draw_all(True, records, depth, colors, size, background, preset, keep)
         if screen is not None:
-            ellipses = Ellipses(*(torch.from_numpy(x) for x in (xy, covariance, opacity, depth, colors)))
-            screen.radius = radii(ellipses, *size, preset).to(means.dtype)
+            screen.radius = torch.from_numpy(radius).to(means.dtype)
         if keep:
             ctx.saved = drawn, world, view, screen
         return groups.picture(), groups.alpha
@@ -409,16 +403,20 @@ class _Gaussians(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grad_outputs: Any) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         drawn, world, view, screen = ctx.saved
-        grad_xy, grad_covariance, *of_splats = drawn.gradients(*grad_outputs)
-        of_world = tuple(np.zeros_like(x) for x in world)
-        _run(gaussian_gradients, grad_xy, grad_covariance, *world, *view, *of_world)
+        n, dtype = len(world[0]), world[0].dtype
+        grads = *(np.zeros_like(x) for x in world), np.zeros((n, drawn.channels), f32)
+        grad_xy = np.zeros((0 if screen is None else n, 2), dtype)
+        drawn.backward(grad_outputs, gaussian_gradients, (*world, *view), (*grads, grad_xy))
         if screen is not None and ctx.needs_input_grad[0]:
             screen.add(torch.from_numpy(grad_xy).to(ctx.like[0][1]))
-        grads = [
+        given = [
             None if like is None else torch.from_numpy(g).reshape(like[0]).to(like[1])
-            for g, like in zip((*of_world, *of_splats), ctx.like, strict=True)
+            for g, like in zip(grads, ctx.like, strict=True)
         ]
-        return *grads, *[None] * 5
+        return *given, *[None] * 5
+
+
+_composite_gaussians: Callable[..., tuple[Tensor, Tensor]] = _Gaussians.apply
 
 
 def _view(camera: Camera, preset: Preset) -> tuple[NDArray[np.float64], ...]:
@@ -427,9 +425,6 @@ def _view(camera: Camera, preset: Preset) -> tuple[NDArray[np.float64], ...]:
     low, high = clamped_directions(camera, preset)
     R, t = (np.ascontiguousarray(x, np.float64) for x in (camera.R, camera.t))
     return K, R, t, K @ R, low, high
-
-
-_composite_gaussians: Callable[..., tuple[Tensor, Tensor]] = _Gaussians.apply
 
 
 # ----------------------------------------------------------------------------------------------------

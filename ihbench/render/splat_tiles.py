@@ -10,11 +10,29 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from ihbench.render.lanes import prefetch
+
 TILE_WIDTH, TILE_HEIGHT = 64, 32  # px
+SHIFT_X, SHIFT_Y = 6, 5
+AHEAD = 16  # how many splats ahead a loop asks for what it will gather
 
 f32, u64 = np.float32, np.uint64
 OPEN = np.int32(2**31 - 1)  # a tile that takes splats of any rank
 ZERO, HALF = f32(0), f32(0.5)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def in_sight(depth, order, keys):
+    """The splats with a depth > 0, and the bits of their depth; how many, and the range of these bits."""
+    m, lowest, highest = 0, np.uint32(0xFFFFFFFF), np.uint32(0)
+    bits = depth.view(np.uint32)
+    for i in range(len(depth)):
+        if depth[i] > ZERO:
+            key = bits[i]
+            order[m], keys[m] = i, key
+            m += 1
+            lowest, highest = min(lowest, key), max(highest, key)
+    return m, lowest, highest
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -53,24 +71,46 @@ def depth_order(order, keys, lowest, highest):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def fetch_record(records, order, rank):
+    if rank + AHEAD < len(order):
+        prefetch(records, u64(order[rank + AHEAD]) * u64(records.shape[1]))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def fetch_slots(slots, rank_of, slot_start, packed, i):
+    """Ask for what the gradient of splat i + AHEAD is made of."""
+    if i + 2 * AHEAD < len(rank_of):
+        prefetch(slot_start, u64(max(rank_of[i + 2 * AHEAD], 0)))
+        rank = u64(max(rank_of[i + AHEAD], 0))
+        prefetch(packed, rank * u64(packed.shape[1]))
+        prefetch(slots, u64(slot_start[rank]) * u64(slots.shape[1]))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def count_tiles(rank, x, y, half_x, half_y, height, width, boxes, counts, closed):
     """How many tiles that take splats of this rank have a pixel centre within half_x, half_y px of (x, y).
 
     Keeps their range in boxes[rank] = first and last column, first and last row, and counts each in counts[tile + 1].
-    Truncation instead of floor: numba calls a library for that one.
+    Truncation instead of floor: numba calls a library for that one. Most splats lie in one tile.
     """
-    x0 = np.int32(max(x - half_x + HALF, ZERO)) // TILE_WIDTH
-    x1 = np.int32(min(max(x + half_x - HALF, f32(-1)), f32(width - 1))) // TILE_WIDTH
-    y0 = np.int32(max(y - half_y + HALF, ZERO)) // TILE_HEIGHT
-    y1 = np.int32(min(max(y + half_y - HALF, f32(-1)), f32(height - 1))) // TILE_HEIGHT
-    boxes[rank, 0], boxes[rank, 1], boxes[rank, 2], boxes[rank, 3] = x0, x1, y0, y1
-    tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
-    found = 0
+    x0 = np.int32(max(x - half_x + HALF, ZERO)) >> SHIFT_X
+    x1 = np.int32(min(max(x + half_x - HALF, f32(-1)), f32(width - 1))) >> SHIFT_X
+    y0 = np.int32(max(y - half_y + HALF, ZERO)) >> SHIFT_Y
+    y1 = np.int32(min(max(y + half_y - HALF, f32(-1)), f32(height - 1))) >> SHIFT_Y
+    box = boxes[u64(rank)]
+    box[0], box[1], box[2], box[3] = x0, x1, y0, y1
+    tiles_x = u64((width + TILE_WIDTH - 1) // TILE_WIDTH)
+    if x0 == x1 and y0 == y1:
+        tile = u64(y0) * tiles_x + u64(x0)
+        listed = rank < closed[tile]
+        counts[tile + u64(1)] += listed
+        return np.int64(listed)
+    found = np.int64(0)
     for ty in range(y0, y1 + 1):
         for tx in range(x0, x1 + 1):
-            tile = ty * tiles_x + tx
+            tile = u64(ty) * tiles_x + u64(tx)
             listed = rank < closed[tile]
-            counts[tile + 1] += listed
+            counts[tile + u64(1)] += listed
             found += listed
     return found
 
@@ -111,11 +151,12 @@ def fill_tiles(boxes, tiles_x, tile_start, closed, ranks, slots):
     cursor = tile_start[:-1].copy()
     slot = 0
     for rank in range(len(boxes)):
-        for ty in range(boxes[rank, 2], boxes[rank, 3] + 1):
-            for tx in range(boxes[rank, 0], boxes[rank, 1] + 1):
-                tile = ty * tiles_x + tx
+        box = boxes[u64(rank)]
+        for ty in range(box[2], box[3] + 1):
+            for tx in range(box[0], box[1] + 1):
+                tile = u64(ty * tiles_x + tx)
                 if rank < closed[tile]:
                     at = cursor[tile]
                     cursor[tile] = at + 1
-                    ranks[at], slots[at] = rank, slot
+                    ranks[u64(at)], slots[u64(at)] = rank, slot
                     slot += 1
