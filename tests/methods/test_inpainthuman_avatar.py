@@ -16,7 +16,7 @@ from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput
 from ihbench.fit.decoded_cache import DECODED_KEPT
 from ihbench.methods.inpainthuman.avatar.avatar import GaussianAvatar
-from ihbench.methods.inpainthuman.avatar.decoder import GaussianDecoder, positional_encoding, scale_factor
+from ihbench.methods.inpainthuman.avatar.decoder import GaussianDecoder, scale_factor
 from ihbench.methods.inpainthuman.config import QUICK
 from ihbench.methods.inpainthuman.method import InpaintHuman
 from ihbench.render.splat import render_gaussians
@@ -154,18 +154,6 @@ def test_features_off_the_charts_are_never_used():
 
 
 # --------------------------------------------------------------------------------------------------- decoder
-
-
-def test_positional_encoding():
-    """[x, sin(π 2^k x), cos(π 2^k x)]; at 0 it is 0, 0 and 1."""
-    zero = positional_encoding(torch.zeros(1, 3), 6)[0]
-    assert zero.shape == (3 + 36,)
-    assert zero.tolist() == [0.0] * 21 + [1.0] * 18
-    points = torch.tensor([[0.1, -0.7, 0.35]], dtype=torch.float64)
-    got = positional_encoding(points, 4)[0]
-    angle = (points[0, :, None] * np.pi * 2.0 ** torch.arange(4, dtype=torch.float64)).flatten()
-    torch.testing.assert_close(got, torch.cat([points[0], angle.sin(), angle.cos()]))
-    assert positional_encoding(points, 0).tolist() == points.tolist()
 
 
 @pytest.mark.parametrize("activation", ["exp", "softplus"])

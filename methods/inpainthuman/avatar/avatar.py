@@ -20,10 +20,11 @@ from ihbench.config_fields import read
 from ihbench.fit.avatar_files import read_avatar, write_avatar
 from ihbench.fit.decoded_cache import DecodedCache
 from ihbench.fit.precision import autocast
-from ihbench.methods.inpainthuman.avatar.decoder import GaussianDecoder, positional_encoding, scale_factor
+from ihbench.methods.inpainthuman.avatar.decoder import GaussianDecoder, scale_factor
 from ihbench.methods.inpainthuman.avatar.pose_residual import ResidualEncoder, root_free_position_map
 from ihbench.methods.inpainthuman.avatar.uv_features import UVFeatures, bilinear_corners
 from ihbench.methods.inpainthuman.config import InpaintHumanConfig
+from ihbench.nets.positional_encoding import positional_encoding
 from ihbench.nets.weighted_rows import weighted_rows
 from ihbench.render.splat import render_gaussians
 from ihbench.render.triangles import triangle_areas, triangle_crosses

@@ -13,13 +13,6 @@ from torch.nn.functional import linear, softplus
 SOFTPLUS_ONE = math.log(math.e - 1)  # softplus of this is 1
 
 
-def positional_encoding(points: Tensor, frequencies: int) -> Tensor:  # [N, 3] m -> [N, 3 + 6 F]
-    """The points themselves, then sine and cosine at 1, 2, 4, … radians per metre × π."""
-    scaled = points[:, :, None] * (math.pi * 2.0 ** torch.arange(frequencies, dtype=points.dtype))
-    flat = scaled.reshape(len(points), 3 * frequencies)
-    return torch.cat([points, flat.sin(), flat.cos()], 1)
-
-
 class GaussianDecoder(nn.Module):
     """`layers` linear layers with ReLU between. The last starts at zero, so a fit begins on the surface, at the
     initial scale, in grey."""
