@@ -45,8 +45,17 @@ def joint_transforms(
 
     The root turns about joint 0, then everything moves by `transl`.
     """
-    local = axis_angle_to_matrix(pose)
-    joints = joints.expand(*torch.broadcast_shapes(pose.shape, joints.shape))
+    return transforms_of_rotations(axis_angle_to_matrix(pose), joints, parents, transl)
+
+
+def transforms_of_rotations(
+    local: Tensor,  # [..., 24, 3, 3] of each joint against its parent, root first
+    joints: Tensor,  # [..., 24, 3] m, joints of the shaped rest pose
+    parents: Sequence[int],  # [24] -1 for the root, parents before children
+    transl: Tensor | None = None,  # [..., 3] m
+) -> Tensor:
+    """`joint_transforms` of rotation matrices."""
+    joints = joints.expand(*torch.broadcast_shapes(local.shape[:-1], joints.shape))
     rotations: list[Tensor] = []  # [..., 3, 3] of each joint in the world
     origins: list[Tensor] = []  # [..., 3] of each joint in the world
     for k, parent in enumerate(int(p) for p in parents):
