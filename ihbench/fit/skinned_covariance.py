@@ -37,9 +37,8 @@ def skinned_covariance(
     factor = quaternion_to_matrix(quaternions) * scales[..., None, :]
     if linear is not None:
         factor = linear @ factor
-    return (factor[..., :, None, :] * factor[..., None, :, :]).sum(
-        -1
-    )  # a matrix product may round (i, j) and (j, i) apart
+    covariance = factor @ factor.mT
+    return (covariance + covariance.mT) / 2  # a matrix product may round (i, j) and (j, i) apart
 
 
 def blended_linear(
