@@ -41,10 +41,11 @@ class ParameterGroup:
     parameters: Sequence[nn.Parameter]
     lr: float
     weight_decay: float = 0.0
+    eps: float = 1e-8
 
 
 @dataclass(frozen=True)
-class _Good:
+class GoodState:
     """A state whose loss and gradients were finite; `step` are done."""
 
     step: int
@@ -86,12 +87,16 @@ class Optimisation(ABC, Generic[Module]):
         self._frozen = [p for p in avatar.parameters() if id(p) not in optimised]
         self.rates = [group.lr for group in groups]
         self.optimizer = torch.optim.AdamW(
-            [{"params": list(g.parameters), "lr": g.lr, "weight_decay": g.weight_decay} for g in groups], fused=True
+            [
+                {"params": list(g.parameters), "lr": g.lr, "weight_decay": g.weight_decay, "eps": g.eps}
+                for g in groups
+            ],
+            fused=True,
         )
         self.names = {id(p): name for name, p in avatar.named_parameters()}
         self.step = 0
         self.rolled_back = 0  # times
-        self._good: _Good | None = None
+        self._good: GoodState | None = None
         self._first_bad: Diverged | None = None
         self._usual: float | None = None  # a loss of this size is nothing to wonder at
 
@@ -170,16 +175,21 @@ class Optimisation(ABC, Generic[Module]):
         share = self._rate_share()
         for group, rate in zip(self.optimizer.param_groups, self.rates, strict=True):
             group["lr"] = rate * share * SMALLER**self.rolled_back
-        self.optimizer.zero_grad(set_to_none=True)
+        self._zero_grad()
         loss = self._loss(k)
         self._check_loss(k, loss.item())
         loss.backward()
-        for group in self.optimizer.param_groups:
-            norm = torch.nn.utils.clip_grad_norm_(group["params"], self.clip_gradient)
-            if not math.isfinite(norm.item()):
-                raise Diverged(self.first_step + self.step, f"gradient norm is {norm.item()}")
+        self._check_gradients()
         if self.step % GOOD_EVERY == 0:
-            self._good = _Good(self.step, {name: value.detach().clone() for name, value in self._tensors().items()})
+            tensors = {name: value.detach().clone() for name, value in self._tensors().items()}
+            self._good = GoodState(self.step, tensors)
+        self._update()
+
+    def _zero_grad(self) -> None:
+        self.optimizer.zero_grad(set_to_none=True)
+
+    def _update(self) -> None:
+        """Change the parameters by their gradients."""
         self.optimizer.step()
 
     # --- the guard ---
@@ -204,6 +214,13 @@ class Optimisation(ABC, Generic[Module]):
             raise Diverged(step, f"loss is {value:.3g}, it was {before:.3g} with the parameters of step {good}")
         self._usual = max(self._usual, before)
 
+    def _check_gradients(self) -> None:
+        """Clip gradients. Raises `Diverged` for one that is not finite."""
+        for group in self.optimizer.param_groups:
+            norm = torch.nn.utils.clip_grad_norm_(group["params"], self.clip_gradient)
+            if not math.isfinite(norm.item()):
+                raise Diverged(self.first_step + self.step, f"gradient norm is {norm.item()}")
+
     @torch.no_grad()
     def _check_end(self) -> None:
         """Raise `Diverged` when the last step, after which no loss is taken, has spoiled the avatar."""
@@ -213,15 +230,15 @@ class Optimisation(ABC, Generic[Module]):
         self._check_loss(k, self._loss(k).item())
 
     @torch.no_grad()
-    def _loss_before(self, k: int, good: _Good) -> float:
+    def _loss_before(self, k: int, good: GoodState) -> float:
         """The loss of view k with the last good parameters; nothing else is touched."""
-        now = {name: p.data for name, p in self.avatar.named_parameters()}
+        now = {name: p.data for name, p in self._parameters()}
         try:
-            for name, p in self.avatar.named_parameters():
+            for name, p in self._parameters():
                 p.data = good.tensors[f"avatar.{name}"]  # not copied into: the graph of a loss may wait for its turn
             return self._loss(k).item()
         finally:
-            for name, p in self.avatar.named_parameters():
+            for name, p in self._parameters():
                 p.data = now[name]
 
     def _roll_back(self, bad: Diverged) -> None:
@@ -246,9 +263,18 @@ class Optimisation(ABC, Generic[Module]):
 
     # --- resume ---
 
+    def _parameters(self) -> list[tuple[str, nn.Parameter]]:
+        """The avatar's parameters with their names, but for those that a subclass saves and restores by itself."""
+        return list(self.avatar.named_parameters())
+
+    def _buffers(self) -> list[tuple[str, Tensor]]:
+        """The avatar's persistent buffers with their names."""
+        parameters = {name for name, _ in self.avatar.named_parameters()}
+        return [(name, value) for name, value in self.avatar.state_dict().items() if name not in parameters]
+
     def _tensors(self) -> dict[str, Tensor]:
         """Parameters, persistent buffers and optimiser moments by name; not copies."""
-        tensors = {f"avatar.{name}": value.detach() for name, value in self.avatar.state_dict().items()}
+        tensors = {f"avatar.{name}": value.detach() for name, value in (*self._parameters(), *self._buffers())}
         for p, state in self.optimizer.state.items():
             for key, value in state.items():
                 tensors[f"adam.{self.names[id(p)]}.{key}"] = value
@@ -258,9 +284,10 @@ class Optimisation(ABC, Generic[Module]):
     def _put(self, tensors: Tensors) -> None:
         """Set parameters, persistent buffers and moments to copies of these."""
         self.optimizer.state.clear()
-        for name, value in self.avatar.state_dict().items():
+        for name, value in self._buffers():
             value.copy_(torch.as_tensor(tensors[f"avatar.{name}"]))
-        for name, p in self.avatar.named_parameters():
+        for name, p in self._parameters():
+            p.copy_(torch.as_tensor(tensors[f"avatar.{name}"]))
             state = {
                 key: torch.as_tensor(tensors[f"adam.{name}.{key}"]).to(p.device, copy=True)
                 for key in ("step", "exp_avg", "exp_avg_sq")
@@ -292,6 +319,6 @@ class Optimisation(ABC, Generic[Module]):
         if "good" in meta:
             named = {name.removeprefix("good."): v for name, v in tensors.items() if name.startswith("good.")}
             device = next(self.avatar.parameters()).device
-            self._good = _Good(meta["good"], {n: torch.as_tensor(v).to(device) for n, v in named.items()})
+            self._good = GoodState(meta["good"], {n: torch.as_tensor(v).to(device) for n, v in named.items()})
         self._restored()
         self.ledger.event(Resumed(self.name, self.step))
