@@ -50,7 +50,7 @@ def body_box(
     pixels = np.round(np.clip(corners[:, :2] - 0.5, -FARTHEST, FARTHEST)).astype(np.int32)
     filled = np.zeros((camera.height, camera.width), np.uint8)
     cv2.fillConvexPoly(filled, cv2.convexHull(pixels), 1)
-    y, x = filled.any(1).nonzero()[0], filled.any(0).nonzero()[0]
+    y, x = np.flatnonzero(filled.max(axis=1)), np.flatnonzero(filled.max(axis=0))
     if not len(y):
         return _whole(camera)
     rows, columns = slice(int(y[0]), int(y[-1]) + 1), slice(int(x[0]), int(x[-1]) + 1)

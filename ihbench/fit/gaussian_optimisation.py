@@ -134,6 +134,9 @@ class GaussianOptimisation(Optimisation[Avatar], Generic[Avatar]):
     def _parameters(self) -> list[tuple[str, nn.Parameter]]:
         return [(name, p) for name, p in super()._parameters() if not name.startswith(GAUSSIANS)]
 
+    def _buffers(self) -> list[tuple[str, Tensor]]:
+        return [(name, value) for name, value in super()._buffers() if not name.startswith(GAUSSIANS)]
+
     def _tensors(self) -> dict[str, Tensor]:
         return super()._tensors() | self.density.tensors()
 
@@ -155,4 +158,5 @@ def _set_of(tensors: Mapping[str, Tensor], like: Gaussians) -> Gaussians:
     """A set with the attributes of another, from what `GaussianAdam.tensors` gave."""
     learned = {name: tensors[f"gaussians.{name}"] for name in like.attributes}
     carried = {name: Carried(tensors[f"carried.{name}"], of_new) for name, of_new in like.of_new.items()}
-    return Gaussians(*(learned.pop(name) for name in SHAPES), learned, carried)
+    means, log_scales, quaternions, opacity_logits = (learned.pop(name) for name in SHAPES)
+    return Gaussians(means, log_scales, quaternions, opacity_logits, learned, carried)

@@ -22,11 +22,13 @@ class PoseCorrection(nn.Module):
 
     def __init__(self, generator: torch.Generator, depth: int = 2, width: int = 128, joints: int = 23):
         super().__init__()
-        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise([3 * joints, *[width] * depth, 3 * joints]))
-        for layer in self.layers:
+        sizes = pairwise([3 * joints, *[width] * depth, 3 * joints])
+        layers = [nn.Linear(inputs, outputs) for inputs, outputs in sizes]
+        for layer in layers:
             nn.init.xavier_uniform_(layer.weight, math.sqrt(2), generator)
             nn.init.zeros_(layer.bias)
-        nn.init.uniform_(self.layers[-1].weight, -LAST_LAYER, LAST_LAYER, generator)
+        nn.init.uniform_(layers[-1].weight, -LAST_LAYER, LAST_LAYER, generator)
+        self.layers = nn.ModuleList(layers)
 
     def forward(
         self,

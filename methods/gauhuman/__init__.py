@@ -1,0 +1,1 @@
+"""GauHuman: articulated anisotropic Gaussians with KL-gated density control; OccGauHuman, made for occlusion."""

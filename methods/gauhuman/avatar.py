@@ -1,0 +1,156 @@
+"""The avatar: anisotropic Gaussians in the big pose, skinned to a frame and splatted."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from ihbench.body import Body
+from ihbench.body.pose import BodyPose
+from ihbench.camera import Camera
+from ihbench.config_fields import read
+from ihbench.errors import BadInput
+from ihbench.fit.gaussians import SHAPES, Gaussians
+from ihbench.fit.skinned_covariance import skinned_covariance
+from ihbench.methods.gauhuman.config import GauHumanConfig
+from ihbench.methods.gauhuman.deformation import Deformation, Frame, Posed
+from ihbench.nets.pose_correction import PoseCorrection
+from ihbench.nets.weight_offsets import WeightOffsets
+from ihbench.render.splat import render_gaussians
+
+KIND = "gauhuman"
+Y00 = 0.28209479177387814  # the spherical harmonic of degree 0
+VERTEX = "vertex"  # what each Gaussian carries: the canonical vertex that it takes its weights from
+DC, REST = "sh_dc", "sh_rest"  # attributes: spherical harmonics of degree 0, and above
+
+
+class GauHumanAvatar(nn.Module):
+    """Gaussians that start on the vertices of the big pose at mean shape, grey, round and of opacity .1, with the two
+    networks that correct pose and weights. `degree` is that of the spherical harmonics in use."""
+
+    def __init__(self, config: GauHumanConfig, body: Body, seed: int):
+        super().__init__()
+        self.config, self.body = config, body
+        self.degree = 0
+        self.deformation = Deformation(body).float()
+        vertices = self.deformation.vertices
+        n, above = len(vertices), (config.highest_degree + 1) ** 2 - 1
+        colours = {DC: torch.full((n, 1, 3), (config.grey - 0.5) / Y00)}
+        if above:
+            colours[REST] = torch.zeros(n, above, 3)
+        self.gaussians = Gaussians.on(vertices, config.opacity, colours, {VERTEX: torch.arange(n)})
+        generator = torch.Generator().manual_seed(seed)
+        self.pose_correction = PoseCorrection(generator) if config.pose_network else None
+        self.weight_offsets = WeightOffsets(seed) if config.weight_network else None
+
+    def __len__(self) -> int:
+        return len(self.gaussians)
+
+    @property
+    def device(self) -> torch.device:
+        return self.gaussians.means.device
+
+    @property
+    def sh(self) -> Tensor:
+        """[N, (degree + 1)², 3] the spherical harmonics in use."""
+        attributes = self.gaussians.attributes
+        above = (self.degree + 1) ** 2 - 1
+        return torch.cat([attributes[DC], attributes[REST][:, :above]], 1) if above else attributes[DC]
+
+    def posed(self, frame: Frame, vertex: Tensor | None = None) -> Posed:  # vertex [N] int64
+        """The Gaussians in a frame; by the vertices that they carry unless others are given."""
+        means = self.gaussians.means
+        return self.deformation(
+            means,
+            self.gaussians.carried(VERTEX) if vertex is None else vertex,
+            frame,
+            self.weight_offsets(means) if self.weight_offsets is not None else None,
+            self.pose_correction(frame.pose) if self.pose_correction is not None else None,
+        )
+
+    def covariances(self, posed: Posed) -> Tensor:
+        """[N, 3, 3] m², world."""
+        return skinned_covariance(self.gaussians.scales, self.gaussians.quaternions, posed.linear)
+
+    def refresh_vertices(self) -> None:
+        """Let each Gaussian carry the vertex that is nearest to it now."""
+        self.gaussians.carried(VERTEX).copy_(self.deformation.nearest(self.gaussians.means))
+
+    def render(
+        self,
+        camera: Camera,
+        body_pose: BodyPose,
+        background: tuple[float, float, float] = (1.0, 1.0, 1.0),
+        frame: int | None = None,  # nothing is learned for single frames
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """rgb [H, W, 3] on `background` and alpha [H, W]; see `scene.contracts.Avatar`. As released, the pose network
+        corrects any pose, also those that nobody trained on."""
+        with torch.no_grad():
+            vertex = self.deformation.nearest(self.gaussians.means)
+            posed = self.posed(self.deformation.frame(body_pose), vertex)
+            rgb, alpha = render_gaussians(
+                posed.means,
+                self.covariances(posed),
+                self.sh,
+                camera,
+                background,
+                opacities=self.gaussians.opacities,
+                sh_degree=self.degree,
+                preset="3dgs",
+            )
+        return rgb.clamp(0, 1).cpu().numpy(), alpha.clamp(0, 1).cpu().numpy()
+
+    def save(self, folder: Path) -> None:
+        """Write `avatar.safetensors` and `avatar.json`: enough to load it again beside the same body.
+
+        Raises `BadInput` when the disk does not take it.
+        """
+        from safetensors.torch import save
+
+        from ihbench.files.atomic import write_bytes, write_json
+
+        state = {name: value.detach().cpu().contiguous() for name, value in self.state_dict().items()}
+        write_bytes(folder / "avatar.safetensors", save(state))
+        words = {"kind": KIND, "config": asdict(self.config), "body": self.body.content_sha(), "degree": self.degree}
+        write_json(folder / "avatar.json", words)
+
+    @classmethod
+    def load(cls, folder: Path, body: Body, device: str = "cpu") -> GauHumanAvatar:
+        """Read what `save` wrote. Raises `BadInput` for a missing or foreign file or another body."""
+        from safetensors import SafetensorError
+        from safetensors.torch import load
+
+        from ihbench.files.atomic import read_json
+        from ihbench.files.regular import read_bytes
+
+        try:
+            words = read_json(folder / "avatar.json")
+            tensors = load(read_bytes(folder / "avatar.safetensors"))
+        except (BadInput, ValueError, KeyError, SafetensorError) as error:
+            raise BadInput(f"{folder}: no readable avatar there: {error}") from error
+        kind = words.get("kind") if isinstance(words, dict) else None
+        if kind != KIND:
+            raise BadInput(f"{folder}: holds an avatar of kind {kind!r}, expected {KIND!r}")
+        fitted, given = words.get("body"), body.content_sha()
+        if fitted != given:
+            raise BadInput(f"{folder}: was fitted on another body ({fitted}) than the one given ({given})")
+        try:
+            avatar = cls(read(GauHumanConfig, words["config"], "avatar.json: config"), body, seed=0)
+            own = "gaussians.attributes."
+            learned = {name: tensors[own + name] for name in avatar.gaussians.attributes}
+            carried = {VERTEX: tensors[f"gaussians.carried_{VERTEX}"]}
+            means, log_scales, quaternions, opacity_logits = (learned.pop(name) for name in SHAPES)
+            avatar.gaussians = Gaussians(means, log_scales, quaternions, opacity_logits, learned, carried)
+            avatar.load_state_dict(tensors)
+            avatar.degree = min(max(int(words["degree"]), 0), avatar.config.highest_degree)
+        except (BadInput, AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
+            raise BadInput(
+                f"{folder}: avatar.json and avatar.safetensors do not belong together or to this version "
+                f"({type(error).__name__}: {str(error).splitlines()[0]}); fit again"
+            ) from error
+        return avatar.to(device)
