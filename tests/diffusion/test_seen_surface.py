@@ -9,9 +9,10 @@ import pytest
 
 from ihbench.body import load_body
 from ihbench.camera import Camera
-from ihbench.diffusion.crops.crop_view import CropView, cut_view, with_elsewhere
+from ihbench.diffusion.crops.crop_view import CropView, cut_view
+from ihbench.diffusion.crops.elsewhere import seen_elsewhere, with_elsewhere
 from ihbench.diffusion.crops.part_map import drawn_body
-from ihbench.diffusion.crops.seen_surface import NOWHERE, SurfaceColours, seen_elsewhere, uv_cells
+from ihbench.diffusion.crops.seen_surface import NOWHERE, SurfaceColours, uv_cells
 from ihbench.scene.contracts import MaskState, TrainView
 from tests.diffusion.test_inpainting_crops import STANDING, camera
 

@@ -14,7 +14,7 @@ from ihbench.camera import Camera
 from ihbench.clock.progress import Progress
 from ihbench.diffusion.crops.part_map import NO_PART, drawn_body, labels_of
 from ihbench.diffusion.crops.person_crop import PersonCrop, person_crop
-from ihbench.diffusion.crops.seen_surface import Cells, seen_elsewhere, uv_cells
+from ihbench.diffusion.crops.seen_surface import Cells, uv_cells
 from ihbench.scene.contracts import MaskState, TrainView
 
 EDGE = 1e-6  # share of a crop's pixel above which it counts
@@ -63,12 +63,6 @@ def cut_view(view: TrainView, index: int, body: Body, size: int, square: bool = 
     raster = drawn_body(vertices, body, camera)
     parts, cells = labels_of(raster, body), uv_cells(raster, body)
     return CropView(index, image, person & ~unknown, unknown, parts, cells, crop, camera, view.body_pose)
-
-
-def with_elsewhere(views: list[CropView], frames: list[CropView]) -> list[CropView]:
-    """The views, each with what the other frames show of its surface."""
-    drawn = seen_elsewhere(views, frames)
-    return [replace(view, elsewhere=seen) for view, seen in zip(views, drawn, strict=True)]
 
 
 def with_frames(asked: list[CropView], frames: list[CropView]) -> list[CropView]:

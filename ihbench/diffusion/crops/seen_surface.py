@@ -1,13 +1,10 @@
-"""The surface that other frames show, drawn into a crop: what a painter need not make up.
+"""Colours of a body's surface as images show them, and drawn into a crop.
 
 Colours live in a grid over the body's UV chart, and in one of twice its cells' size for what a fine cell has no pixel
-of. A pixel of the posed body is given the colour that the frame nearest in time shows of its cell.
+of.
 """
 
 from __future__ import annotations
-
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -15,9 +12,6 @@ from numpy.typing import NDArray
 
 from ihbench.body import Body
 from ihbench.render.zbuffer import Raster
-
-if TYPE_CHECKING:
-    from ihbench.diffusion.crops.crop_view import CropView
 
 SIDE = 128  # cells along a side of the chart: about a centimetre, a pixel of a crop
 NOWHERE = SIDE * SIDE  # the cell of pixels off the body
@@ -68,24 +62,3 @@ class SurfaceColours:
         frame = self.frame[used]
         seen = (frame > -NEVER)[..., None]
         return np.concatenate([self.colour[used] * seen, 255 * seen.astype(np.uint8)], -1), frame
-
-
-def seen_elsewhere(views: Sequence[CropView], frames: Iterable[CropView]) -> list[NDArray[np.uint8]]:
-    """[S, W, 4] for each view: its surface as another frame shows it, the nearest in index and the earlier of two as
-    near; RGB and 255 where one does, else 0."""
-    frames = sorted(frames, key=lambda frame: frame.index)
-    best = [np.zeros((*view.cells.shape, 4), np.uint8) for view in views]
-    away = [np.full(view.cells.shape, NEVER) for view in views]
-    for direction in (1, -1):
-        known, rest = SurfaceColours(), list(frames[::-direction])  # the next one last
-        for k in sorted(range(len(views)), key=lambda k: direction * views[k].index):
-            view = views[k]
-            while rest and direction * rest[-1].index < direction * view.index:
-                frame = rest.pop()
-                known.show(frame.cells, frame.image, frame.person, frame.index)
-            drawn, frame = known.drawn(view.cells)
-            distance = np.abs(frame - view.index)
-            nearer = distance < np.minimum(away[k], NEVER // 2)
-            best[k][nearer] = drawn[nearer]
-            away[k][nearer] = distance[nearer]
-    return best

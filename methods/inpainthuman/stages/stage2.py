@@ -12,7 +12,8 @@ from ihbench.clock.checkpoints import Tensors
 from ihbench.clock.events import Inpainted, LeftOut, LossCurve, Resumed
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.diffusion.crops.crop_view import CropView, Inpainter, cut_view, with_elsewhere, with_frames
+from ihbench.diffusion.crops.crop_view import CropView, Inpainter, cut_view, with_frames
+from ihbench.diffusion.crops.elsewhere import with_elsewhere
 from ihbench.diffusion.inpaint_config import InpaintConfig
 from ihbench.methods.inpainthuman.avatar.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.inpainting.painted_view import PaintedView, paste_back

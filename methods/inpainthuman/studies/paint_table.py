@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from ihbench.body import Body
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.diffusion.crops.crop_view import CropView, cut_view, with_elsewhere
+from ihbench.diffusion.crops.crop_view import CropView, cut_view
+from ihbench.diffusion.crops.elsewhere import with_elsewhere
 from ihbench.diffusion.inpaint_config import COMPONENTS, FULL, SIMPLE, InpaintConfig
 from ihbench.document.document import Block, Heading, Table
 from ihbench.errors import BadInput
