@@ -15,8 +15,8 @@ from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.config_fields import read
 from ihbench.errors import BadInput
-from ihbench.fit.gaussians import SHAPES, Gaussians
-from ihbench.fit.skinned_covariance import skinned_covariance
+from ihbench.fit.gaussians.gaussian_set import SHAPES, Gaussians
+from ihbench.fit.gaussians.skinned_covariance import skinned_covariance
 from ihbench.methods.gauhuman.config import GauHumanConfig
 from ihbench.methods.gauhuman.deformation import Deformation, Frame, Posed
 from ihbench.nets.pose_correction import PoseCorrection

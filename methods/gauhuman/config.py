@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from ihbench.config_fields import STEPS, Within, check
-from ihbench.fit.density_config import DensityConfig
+from ihbench.fit.gaussians.density_config import DensityConfig
 from ihbench.metrics.weights import FILES, locate
 from ihbench.scene.plan import Omission, SceneMeasure
 

@@ -11,10 +11,10 @@ from torch import Tensor
 from ihbench.clock.events import LeftOut
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.fit.density import DensityChanged, DensityRules, farther_than
-from ihbench.fit.density_config import DensityConfig
-from ihbench.fit.gaussian_adam import Rate
-from ihbench.fit.gaussian_optimisation import EPS, GaussianOptimisation
+from ihbench.fit.gaussians.adam import Rate
+from ihbench.fit.gaussians.density import DensityChanged, DensityRules, farther_than
+from ihbench.fit.gaussians.density_config import DensityConfig
+from ihbench.fit.gaussians.optimisation import EPS, GaussianOptimisation
 from ihbench.fit.losses import Perceptual, perceptual
 from ihbench.fit.optimisation import ParameterGroup
 from ihbench.methods.gauhuman.avatar import DC, REST, GauHumanAvatar

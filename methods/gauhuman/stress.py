@@ -16,7 +16,7 @@ import numpy as np
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
-from ihbench.fit.density_config import DensityConfig
+from ihbench.fit.gaussians.density_config import DensityConfig
 from ihbench.methods.gauhuman.config import OCCLUDED, SMOKE, GauHumanConfig
 from ihbench.methods.gauhuman.method import GauHuman
 from ihbench.scene.contracts import MaskState, TrainingSet, TrainView
@@ -147,8 +147,8 @@ def _one_gaussian() -> Answer:
     """Density control of a single Gaussian: it has no neighbour."""
     import torch
 
-    from ihbench.fit.density import divergence_to_nearest
-    from ihbench.fit.gaussians import Gaussians
+    from ihbench.fit.gaussians.density import divergence_to_nearest
+    from ihbench.fit.gaussians.gaussian_set import Gaussians
 
     alone = Gaussians.on(torch.zeros(1, 3))
     return Answer(float(divergence_to_nearest(alone)[0][0]), math.inf)

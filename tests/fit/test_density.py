@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from ihbench.clock.checkpoints import States
 from ihbench.errors import BadInput, Diverged
-from ihbench.fit.density import (
+from ihbench.fit.gaussians.adam import GaussianAdam, Rate, rates_3dgs
+from ihbench.fit.gaussians.density import (
     DensityControl,
     DensityRules,
     divergence_to_nearest,
@@ -22,10 +23,9 @@ from ihbench.fit.density import (
     reset_opacity,
     split,
 )
-from ihbench.fit.density_config import DensityConfig
-from ihbench.fit.gaussian_adam import GaussianAdam, Rate, rates_3dgs
-from ihbench.fit.gaussians import Carried, Gaussians, to_logit
-from ihbench.fit.skinned_covariance import skinned_covariance
+from ihbench.fit.gaussians.density_config import DensityConfig
+from ihbench.fit.gaussians.gaussian_set import Carried, Gaussians, to_logit
+from ihbench.fit.gaussians.skinned_covariance import skinned_covariance
 
 PLAIN = DensityConfig(after=0, before=100, every=10, kl_grow=None, kl_merge=None, faint=None)
 EVENT = 10

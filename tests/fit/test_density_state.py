@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from ihbench.fit.density_state import DensityState
-from ihbench.fit.gaussians import Rows
+from ihbench.fit.gaussians.density_state import DensityState
+from ihbench.fit.gaussians.gaussian_set import Rows
 
 SIDES = (200, 100)  # px, width and height
 

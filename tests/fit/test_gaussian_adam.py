@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from ihbench.clock.checkpoints import States
-from ihbench.fit.gaussian_adam import MOMENTS, GaussianAdam, Rate, rates_3dgs
-from ihbench.fit.gaussians import Carried, Gaussians, Rows, to_logit
-from ihbench.fit.neighbours import spacing
+from ihbench.fit.gaussians.adam import MOMENTS, GaussianAdam, Rate, rates_3dgs
+from ihbench.fit.gaussians.gaussian_set import Carried, Gaussians, Rows, to_logit
+from ihbench.fit.gaussians.neighbours import spacing
 
 
 def random(*shape, seed=0):

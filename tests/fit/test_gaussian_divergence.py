@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.distributions import MultivariateNormal, kl_divergence
 
-from ihbench.fit.gaussian_divergence import gaussian_divergence
-from ihbench.fit.skinned_covariance import quaternion_to_matrix, skinned_covariance
+from ihbench.fit.gaussians.divergence import gaussian_divergence
+from ihbench.fit.gaussians.skinned_covariance import quaternion_to_matrix, skinned_covariance
 
 UPRIGHT = torch.tensor([[1.0, 0, 0, 0]])
 

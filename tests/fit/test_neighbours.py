@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from ihbench.fit.neighbours import SMALLEST_SPACING, distance_to, nearest, spacing
+from ihbench.fit.gaussians.neighbours import SMALLEST_SPACING, distance_to, nearest, spacing
 
 
 def test_against_all_distances():

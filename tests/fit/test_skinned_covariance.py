@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from ihbench.body.skinning import axis_angle_to_matrix, lbs
-from ihbench.fit.skinned_covariance import blended_linear, quaternion_to_matrix, skinned_covariance
+from ihbench.fit.gaussians.skinned_covariance import blended_linear, quaternion_to_matrix, skinned_covariance
 
 
 def some(count=20, seed=0):

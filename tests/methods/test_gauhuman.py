@@ -12,8 +12,8 @@ from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput, Diverged
-from ihbench.fit.gaussians import Gaussians
-from ihbench.fit.neighbours import distance_to
+from ihbench.fit.gaussians.gaussian_set import Gaussians
+from ihbench.fit.gaussians.neighbours import distance_to
 from ihbench.methods.gauhuman.config import (
     OCCGAUHUMAN_PROFILES,
     OCCLUDED,

@@ -9,7 +9,7 @@ import pytest
 
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.fit.density_config import DensityConfig
+from ihbench.fit.gaussians.density_config import DensityConfig
 from ihbench.methods.gauhuman.avatar import GauHumanAvatar
 from ihbench.methods.gauhuman.config import SMOKE
 from ihbench.methods.gauhuman.fitting import GauHumanFit

@@ -19,13 +19,13 @@ from torch import Tensor
 
 from ihbench.clock.checkpoints import Tensors
 from ihbench.errors import Diverged
-from ihbench.fit.density_config import DensityConfig
-from ihbench.fit.density_state import DensityState
-from ihbench.fit.gaussian_adam import GaussianAdam
-from ihbench.fit.gaussian_divergence import gaussian_divergence
-from ihbench.fit.gaussians import Gaussians, Rows, to_logit
-from ihbench.fit.neighbours import distance_to, nearest
-from ihbench.fit.skinned_covariance import quaternion_to_matrix
+from ihbench.fit.gaussians.adam import GaussianAdam
+from ihbench.fit.gaussians.density_config import DensityConfig
+from ihbench.fit.gaussians.density_state import DensityState
+from ihbench.fit.gaussians.divergence import gaussian_divergence
+from ihbench.fit.gaussians.gaussian_set import Gaussians, Rows, to_logit
+from ihbench.fit.gaussians.neighbours import distance_to, nearest
+from ihbench.fit.gaussians.skinned_covariance import quaternion_to_matrix
 
 Mask = Callable[[Gaussians], Tensor]  # [N] bool of the set as it then is
 CLONE, SPLIT = range(2)  # what random numbers are drawn for

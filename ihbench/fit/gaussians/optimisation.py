@@ -18,10 +18,10 @@ from torch import Tensor, nn
 from ihbench.clock.checkpoints import Tensors
 from ihbench.clock.ledger import Ledger
 from ihbench.errors import Diverged
-from ihbench.fit.density import DensityChanged, DensityControl, DensityRules
-from ihbench.fit.density_config import DensityConfig
-from ihbench.fit.gaussian_adam import GaussianAdam, Rate
-from ihbench.fit.gaussians import SHAPES, Carried, Gaussians
+from ihbench.fit.gaussians.adam import GaussianAdam, Rate
+from ihbench.fit.gaussians.density import DensityChanged, DensityControl, DensityRules
+from ihbench.fit.gaussians.density_config import DensityConfig
+from ihbench.fit.gaussians.gaussian_set import SHAPES, Carried, Gaussians
 from ihbench.fit.optimisation import SMALLER, GoodState, Optimisation, ParameterGroup
 from ihbench.scene.contracts import TrainingSet
 

@@ -15,7 +15,7 @@ import math
 import torch
 from torch import Tensor
 
-from ihbench.fit.skinned_covariance import quaternion_to_matrix
+from ihbench.fit.gaussians.skinned_covariance import quaternion_to_matrix
 
 SERIES_BELOW = 0.1  # there eˣ - 1 - x would lose digits
 LARGEST_EXPONENT = 300.0  # keeps squares finite, so that nothing becomes 0 times infinity

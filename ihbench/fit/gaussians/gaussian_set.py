@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from ihbench.fit.neighbours import spacing
+from ihbench.fit.gaussians.neighbours import spacing
 
 SHAPES = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "opacity_logits": ()}
 OPACITY_ENDS = 1e-6  # opacities are kept this far from 0 and 1 when their logit is taken

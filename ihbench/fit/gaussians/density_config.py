@@ -1,4 +1,4 @@
-"""Switches of density control (`ihbench.fit.density`)."""
+"""Switches of density control (`ihbench.fit.gaussians.density`)."""
 
 from __future__ import annotations
 

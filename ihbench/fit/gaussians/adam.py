@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from ihbench.clock.checkpoints import Tensors
-from ihbench.fit.gaussians import CARRIED, Gaussians, Rows
+from ihbench.fit.gaussians.gaussian_set import CARRIED, Gaussians, Rows
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
 

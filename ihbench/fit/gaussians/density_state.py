@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ihbench.clock.checkpoints import Tensors
-from ihbench.fit.gaussians import Rows
+from ihbench.fit.gaussians.gaussian_set import Rows
 
 NAME = "density."  # before the names of saved tensors
 
