@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
 from typing import Any, Literal, overload
@@ -42,27 +41,10 @@ from ihbench.render.splat_projection import (
     project_ellipses,
     radii,
 )  # fmt: skip
-from ihbench.render.splats import Ellipses, Preset, Splats, as_ellipses
+from ihbench.render.splats import Ellipses, Preset, Screen, Splats, as_ellipses
 
 BACKENDS = ("auto", "reference", "numba", "gsplat")
 OUTPUTS = ("rgb", "alpha", "depth", "screen")
-
-
-@dataclass
-class Screen:
-    """What density control needs to know about each Gaussian of one picture."""
-
-    radius: Tensor  # [N] px: where alpha ends, along the longer axis; 0 for Gaussians that are not in the picture
-    gradient: Tensor | None = None  # [N, 2] along the centres, per px; of all backward passes so far, None before
-
-    @property
-    def visible(self) -> Tensor:
-        """[N] bool: those that reach a pixel, be they hidden behind others or not."""
-        return self.radius > 0
-
-    def add(self, gradient: Tensor) -> None:
-        """One more backward pass's gradient along the centres, [N, 2] per px."""
-        self.gradient = gradient if self.gradient is None else self.gradient + gradient
 
 
 @overload

@@ -58,7 +58,7 @@ from ihbench.render.splat_tiles import OPEN, TILE_HEIGHT, TILE_WIDTH, depth_orde
 from ihbench.render.splats import PRESETS, Ellipses, Preset, Splats, as_ellipses
 
 if TYPE_CHECKING:
-    from ihbench.render.splat import Screen
+    from ihbench.render.splats import Screen
 
 T_STOP = 1e-5  # a transmittance below it counts as none
 T_LEAST = 1e-10  # what a preset that never stops stops at, against underflow

@@ -61,3 +61,20 @@ def as_ellipses(splats: Splats | Ellipses) -> Ellipses:
     v = splats.variance
     covariance = torch.stack([v, torch.zeros_like(v), v], 1)
     return Ellipses(splats.xy, covariance, torch.ones_like(v), splats.depth, splats.colors)
+
+
+@dataclass
+class Screen:
+    """What density control needs to know about each Gaussian of one picture."""
+
+    radius: Tensor  # [N] px: where alpha ends, along the longer axis; 0 for Gaussians that are not in the picture
+    gradient: Tensor | None = None  # [N, 2] along the centres, per px; of all backward passes so far, None before
+
+    @property
+    def visible(self) -> Tensor:
+        """[N] bool: those that reach a pixel, be they hidden behind others or not."""
+        return self.radius > 0
+
+    def add(self, gradient: Tensor) -> None:
+        """One more backward pass's gradient along the centres, [N, 2] per px."""
+        self.gradient = gradient if self.gradient is None else self.gradient + gradient
