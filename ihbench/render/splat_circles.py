@@ -17,7 +17,6 @@ from ihbench.render.splat_tiles import (
     close_tiles,
     count_tiles,
     f32,
-    fetch_record,
     fetch_slots,
     u64,
 )
@@ -93,7 +92,6 @@ def pack_circles(
     """Fill `packed` [M, CIRCLE] in depth order and what `splat_tiles` wants; returns the number of entries."""
     entries = 0
     for rank in range(len(order)):
-        fetch_record(records, order, rank)
         i, p = u64(order[rank]), packed[u64(rank)]
         for c in range(u64(CIRCLE)):
             p[c] = records[i, c]

@@ -71,12 +71,6 @@ def depth_order(order, keys, lowest, highest):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def fetch_record(records, order, rank):
-    if rank + AHEAD < len(order):
-        prefetch(records, u64(order[rank + AHEAD]) * u64(records.shape[1]))
-
-
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def fetch_slots(slots, rank_of, slot_start, packed, i):
     """Ask for what the gradient of splat i + AHEAD is made of."""
     if i + 2 * AHEAD < len(rank_of):
