@@ -25,7 +25,7 @@ def write_avatar(
     module: nn.Module,
     config: Config,
     body: Body,
-    betas: NDArray[np.float64],
+    betas: NDArray[np.float64] | None = None,
     **more: object,  # what else the module needs to be itself; JSON-able
 ) -> None:
     """Enough to make the avatar again beside the same body. Raises `BadInput` when the disk does not take it."""
@@ -35,7 +35,9 @@ def write_avatar(
 
     state = {name: value.detach().cpu().contiguous() for name, value in module.state_dict().items()}
     write_bytes(folder / "avatar.safetensors", save(state))
-    words = {"kind": kind, "config": asdict(config), "betas": betas.tolist(), "body": body.content_sha(), **more}
+    words = {"kind": kind, "config": asdict(config), "body": body.content_sha(), **more}
+    if betas is not None:
+        words["betas"] = betas.tolist()
     write_json(folder / "avatar.json", words)
 
 

@@ -141,7 +141,7 @@ def _harmonic(index: int, direction: Sequence[float], value: float) -> Answer:
     return Answer(got, 0.5 * max(0.0, 0.5 + 0.5 * value))
 
 
-def _cloud(count: int, seed: int = 0) -> dict[str, NDArray]:
+def _cloud(count: int, seed: int = 0) -> dict[str, Any]:
     rng = np.random.default_rng(seed)
     return {
         "means": rng.uniform(-0.5, 0.5, (count, 3)) + np.array([0, 0, 2.0]),
@@ -165,13 +165,14 @@ def _pieces(number: int) -> dict[str, Any]:
 
 
 def _one_bad(number: int) -> Answer:
-    without = {name: np.delete(x, 7, 0) for name, x in _cloud(40).items()}
+    without: dict[str, Any] = {name: np.delete(x, 7, 0) for name, x in _cloud(40).items()}
     return Answer(draw(**_pieces(number)), draw(**without))
 
 
 def _permuted() -> Answer:
     order = np.random.default_rng(1).permutation(200)
-    return Answer(draw(**{name: x[order] for name, x in _cloud(200).items()}), draw(**_cloud(200)))
+    permuted: dict[str, Any] = {name: x[order] for name, x in _cloud(200).items()}
+    return Answer(draw(**permuted), draw(**_cloud(200)))
 
 
 def _gradient(preset: str, stretch: float) -> Answer:
@@ -182,8 +183,8 @@ def _gradient(preset: str, stretch: float) -> Answer:
 
     cloud = _cloud(150)
     cloud["spread"][:, 0] *= stretch
-    tensors = [torch.tensor(x, dtype=torch.float32) for x in cloud.values()]
-    scene = Gaussians(*tensors[:3], camera(), *tensors[3:], preset=preset)  # pyright: ignore[reportArgumentType]
+    tensors: dict[str, Any] = {name: torch.tensor(x, dtype=torch.float32) for name, x in cloud.items()}
+    scene = Gaussians(scales=tensors.pop("spread"), camera=camera(), preset=preset, **tensors)  # pyright: ignore[reportArgumentType]
     errors = compare_with_twin(scene, "numba")
     return Answer(list(errors.gradient.values()), 0.0, note=f"image: {errors.image:.1e}")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from ihbench.body import Body
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.config_fields import read
-from ihbench.errors import BadInput
+from ihbench.fit.avatar_files import read_avatar, write_avatar
 from ihbench.fit.gaussians.gaussian_set import SHAPES, Gaussians
 from ihbench.fit.gaussians.skinned_covariance import skinned_covariance
 from ihbench.methods.gauhuman.config import GauHumanConfig
@@ -110,47 +109,20 @@ class GauHumanAvatar(nn.Module):
 
         Raises `BadInput` when the disk does not take it.
         """
-        from safetensors.torch import save
-
-        from ihbench.files.atomic import write_bytes, write_json
-
-        state = {name: value.detach().cpu().contiguous() for name, value in self.state_dict().items()}
-        write_bytes(folder / "avatar.safetensors", save(state))
-        words = {"kind": KIND, "config": asdict(self.config), "body": self.body.content_sha(), "degree": self.degree}
-        write_json(folder / "avatar.json", words)
+        write_avatar(folder, KIND, self, self.config, self.body, degree=self.degree)
 
     @classmethod
     def load(cls, folder: Path, body: Body, device: str = "cpu") -> GauHumanAvatar:
         """Read what `save` wrote. Raises `BadInput` for a missing or foreign file or another body."""
-        from safetensors import SafetensorError
-        from safetensors.torch import load
-
-        from ihbench.files.atomic import read_json
-        from ihbench.files.regular import read_bytes
-
-        try:
-            words = read_json(folder / "avatar.json")
-            tensors = load(read_bytes(folder / "avatar.safetensors"))
-        except (BadInput, ValueError, KeyError, SafetensorError) as error:
-            raise BadInput(f"{folder}: no readable avatar there: {error}") from error
-        kind = words.get("kind") if isinstance(words, dict) else None
-        if kind != KIND:
-            raise BadInput(f"{folder}: holds an avatar of kind {kind!r}, expected {KIND!r}")
-        fitted, given = words.get("body"), body.content_sha()
-        if fitted != given:
-            raise BadInput(f"{folder}: was fitted on another body ({fitted}) than the one given ({given})")
-        try:
-            avatar = cls(read(GauHumanConfig, words["config"], "avatar.json: config"), body, seed=0)
+        saved = read_avatar(folder, KIND, body)
+        with saved.put_together():
+            tensors = saved.tensors
+            avatar = cls(read(GauHumanConfig, saved.words["config"], "avatar.json: config"), body, seed=0)
             own = "gaussians.attributes."
             learned = {name: tensors[own + name] for name in avatar.gaussians.attributes}
             carried = {VERTEX: tensors[f"gaussians.carried_{VERTEX}"]}
             means, log_scales, quaternions, opacity_logits = (learned.pop(name) for name in SHAPES)
             avatar.gaussians = Gaussians(means, log_scales, quaternions, opacity_logits, learned, carried)
             avatar.load_state_dict(tensors)
-            avatar.degree = min(max(int(words["degree"]), 0), avatar.config.highest_degree)
-        except (BadInput, AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise BadInput(
-                f"{folder}: avatar.json and avatar.safetensors do not belong together or to this version "
-                f"({type(error).__name__}: {str(error).splitlines()[0]}); fit again"
-            ) from error
+            avatar.degree = min(max(int(saved.words["degree"]), 0), avatar.config.highest_degree)
         return avatar.to(device)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -21,6 +20,7 @@ from ihbench.methods.gaussianavatar.stages import Stage1
 from ihbench.scene.contracts import MaskState, TrainingSet
 from ihbench.stress.case import Answer, Case, Unit, words_of
 from ihbench.stress.drawn_capture import WHITE, the_body
+from ihbench.stress.resuming import changed_by_a_kill
 from ihbench.stress.six_views import (
     all_unknown,
     only_a_pixel,
@@ -106,32 +106,12 @@ def _hidden_bad_pixels(unknown: Any) -> Answer:
 
 def _resumed() -> Answer:
     """Killed, and gone on with from the state of step 11: the same bits as without."""
-
-    class SavesAt11(Ledger):
-        def due_to_save(self) -> bool:
-            return stage.step == 11
-
-    class Killed(Exception):
-        pass
-
     whole, _ = fitted(TINY)
-    ledger = SavesAt11()
-    stage = Stage1(fresh(TINY), training_set(), 0, ledger)
-    one_step = stage._one_step
-
-    def until_killed(k: int) -> None:
-        if stage.step == 14:
-            raise Killed
-        one_step(k)
-
-    stage._one_step = until_killed
-    with suppress(Killed):
-        stage.run(Progress.silent())
-    again = fresh(TINY)
-    Stage1(again, training_set(), 0, ledger).run(Progress.silent())
     assert whole is not None
-    pairs = zip(whole.state_dict().values(), again.state_dict().values(), strict=True)
-    return Answer(sum(int((a != b).sum()) for a, b in pairs), 0)
+    training = training_set()
+    return Answer(
+        changed_by_a_kill(lambda: fresh(TINY), lambda avatar, ledger: Stage1(avatar, training, 0, ledger), whole), 0
+    )
 
 
 def _training(

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -26,6 +25,7 @@ from ihbench.methods.inpainthuman.stages.stage1 import Stage1, loss_of, prepare_
 from ihbench.scene.contracts import MaskState, TrainingSet, TrainView
 from ihbench.stress.case import Answer, Case, Unit, words_of
 from ihbench.stress.drawn_capture import WHITE, the_body
+from ihbench.stress.resuming import changed_by_a_kill
 from ihbench.stress.six_views import (
     SIZE,
     all_unknown,
@@ -272,33 +272,13 @@ def _bad_start() -> Answer:
 
 def _resumed() -> Answer:
     """Killed after a step was rejected, and gone on with from the state of step 11: the same bits as without."""
-
-    class SavesAt11(Ledger):
-        def due_to_save(self) -> bool:
-            return stage.step == 11
-
-    class Killed(Exception):
-        pass
-
     config = scaled_rates(1000.0)
     whole, _ = fitted(config)
-    ledger = SavesAt11()
-    stage = Stage1(fresh(config), training_set(), 0, ledger)
-    one_step = stage._one_step
-
-    def until_killed(k: int) -> None:
-        if stage.step == 14:
-            raise Killed
-        one_step(k)
-
-    stage._one_step = until_killed
-    with suppress(Killed):
-        stage.run(Progress.silent())
-    again = fresh(config)
-    Stage1(again, training_set(), 0, ledger).run(Progress.silent())
     assert whole is not None
-    pairs = zip(whole.parameters(), again.parameters(), strict=True)
-    return Answer(sum(int((a != b).sum()) for a, b in pairs), 0)
+    training = training_set()
+    return Answer(
+        changed_by_a_kill(lambda: fresh(config), lambda avatar, ledger: Stage1(avatar, training, 0, ledger), whole), 0
+    )
 
 
 # ----------------------------------------------------------------------------------------------------
