@@ -12,6 +12,7 @@ from numba import njit
 
 from ihbench.render.lanes import exp2, lanes, store, zeros
 from ihbench.render.splat_tiles import (
+    BLOCK,
     TILE_HEIGHT,
     TILE_WIDTH,
     close_tiles,
@@ -43,7 +44,8 @@ def project_circles(
     cannot overflow.
     """
     R, t, n = to_pixels, offset, len(means)
-    for i in range(n * part // parts, n * (part + 1) // parts):
+    for at in range(n * part // parts, n * (part + 1) // parts):
+        i = u64(at)
         X, Y, Z = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
         z = R[2, 0] * X + R[2, 1] * Y + R[2, 2] * Z + t[2]
         inverse = 1.0 / z
@@ -52,7 +54,7 @@ def project_circles(
         y = f32((R[1, 0] * X + R[1, 1] * Y + R[1, 2] * Z + t[1]) * inverse)
         v, distance = f32(s * s * focal2 + low_pass), f32(z)
         bad = x - x + (y - y) + (v - v) + (distance - distance)  # NaN where one is not finite
-        for c in range(colors.shape[1]):
+        for c in range(u64(colors.shape[1])):
             bad += colors[i, c] - colors[i, c]
         depth[i] = ZERO
         if not (bad == ZERO and distance > near):
@@ -69,8 +71,8 @@ def project_circles(
         reach = f32(math.sqrt(cut)) * f32(1.00005)
         p = records[i]
         p[0], p[1], p[2], p[3] = x, y, math.sqrt(f32(HALF_LOG2_E) / v), reach
-        for c in range(min(colors.shape[1], 3)):
-            p[CIRCLE_COLOR + c] = colors[i, c]
+        for c in range(u64(3)):
+            p[u64(CIRCLE_COLOR) + c] = colors[i, c] if c < u64(colors.shape[1]) else ZERO
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
@@ -90,18 +92,29 @@ def pack_circles(
     slot_start,
 ):
     """Fill `packed` [M, CIRCLE] in depth order and what `splat_tiles` wants; returns the number of entries."""
-    entries = 0
-    for rank in range(len(order)):
-        i, p = u64(order[rank]), packed[u64(rank)]
-        for c in range(u64(CIRCLE)):
-            p[c] = records[i, c]
-        slot_start[u64(rank)] = entries
-        entries += count_tiles(rank, p[0], p[1], p[3], p[3], height, width, boxes, counts, closed)
-        if p[3] > f32(TILE_WIDTH):  # a smaller circle hides no tile
-            close_tiles(
-                rank, p[0], p[1], ZERO, p[2], p[2], ZERO, alpha_min, alpha_max, t_stop, width, boxes, let_through,
-                closed,
-            )  # fmt: skip
+    entries, count = 0, len(order)
+    for block in range(0, count, BLOCK):
+        end, largest = min(block + BLOCK, count), ZERO
+        for rank in range(u64(block), u64(end)):
+            i, p = u64(order[rank]), packed[rank]
+            for c in range(u64(CIRCLE)):
+                p[c] = records[i, c]
+            largest = max(largest, p[3])
+        if largest <= f32(TILE_WIDTH):  # they hide no tile, and without calls all stays in registers
+            for rank in range(block, end):
+                p = packed[u64(rank)]
+                slot_start[u64(rank)] = entries
+                entries += count_tiles(rank, p[0], p[1], p[3], p[3], height, width, boxes, counts, closed)
+            continue
+        for rank in range(block, end):
+            p = packed[u64(rank)]
+            slot_start[u64(rank)] = entries
+            entries += count_tiles(rank, p[0], p[1], p[3], p[3], height, width, boxes, counts, closed)
+            if p[3] > f32(TILE_WIDTH):
+                close_tiles(
+                    rank, p[0], p[1], ZERO, p[2], p[2], ZERO, alpha_min, alpha_max, t_stop, width, boxes, let_through,
+                    closed,
+                )  # fmt: skip
     slot_start[len(order)] = entries
     return entries
 
@@ -154,9 +167,14 @@ def circle_gradients(
     not empty."""
     R, n = to_pixels, len(rank_of)
     channels = min(grad_colors.shape[1] - first, 3)
-    for i in range(n * part // parts, n * (part + 1) // parts):
-        fetch_slots(slots, rank_of, slot_start, packed, i)
+    for at in range(n * part // parts, n * (part + 1) // parts):
+        fetch_slots(slots, rank_of, slot_start, packed, at)
+        i = u64(at)
         if rank_of[i] < 0:
+            for c in range(channels):
+                grad_colors[i, first + c] = ZERO
+            if last:
+                grad_scales[i] = grad_means[i, 0] = grad_means[i, 1] = grad_means[i, 2] = ZERO
             continue
         rank = u64(rank_of[i])
         sx = sy = sd = r = g = b = 0.0

@@ -28,6 +28,7 @@ from ihbench.render.lanes import (
 )
 from ihbench.render.splat_circles import SEGMENT, hidden
 from ihbench.render.splat_tiles import (
+    BLOCK,
     TILE_HEIGHT,
     TILE_WIDTH,
     close_tiles,
@@ -106,18 +107,29 @@ def pack_ellipses(
     slot_start,
 ):
     """Fill `packed` [M, ELLIPSE] in depth order and what `splat_tiles` wants; returns the number of entries."""
-    entries = 0
-    for rank in range(len(order)):
-        i, p = u64(order[rank]), packed[u64(rank)]
-        for c in range(u64(ELLIPSE)):
-            p[c] = records[i, c]
-        slot_start[u64(rank)] = entries
-        entries += count_tiles(rank, p[0], p[1], p[7], p[8], height, width, boxes, counts, closed)
-        if p[7] > f32(TILE_WIDTH / 2) and p[8] > f32(TILE_HEIGHT / 2):  # a smaller ellipse hides no tile
-            close_tiles(
-                rank, p[0], p[1], p[4], p[2], p[3], p[5], alpha_min, alpha_max, t_stop, width, boxes, let_through,
-                closed,
-            )  # fmt: skip
+    entries, count = 0, len(order)
+    for block in range(0, count, BLOCK):
+        end, largest = min(block + BLOCK, count), ZERO
+        for rank in range(u64(block), u64(end)):
+            i, p = u64(order[rank]), packed[rank]
+            for c in range(u64(ELLIPSE)):
+                p[c] = records[i, c]
+            largest = max(largest, min(p[7], p[8] * f32(TILE_WIDTH / TILE_HEIGHT)))
+        if largest <= f32(TILE_WIDTH / 2):  # they hide no tile, and without calls all stays in registers
+            for rank in range(block, end):
+                p = packed[u64(rank)]
+                slot_start[u64(rank)] = entries
+                entries += count_tiles(rank, p[0], p[1], p[7], p[8], height, width, boxes, counts, closed)
+            continue
+        for rank in range(block, end):
+            p = packed[u64(rank)]
+            slot_start[u64(rank)] = entries
+            entries += count_tiles(rank, p[0], p[1], p[7], p[8], height, width, boxes, counts, closed)
+            if p[7] > f32(TILE_WIDTH / 2) and p[8] > f32(TILE_HEIGHT / 2):
+                close_tiles(
+                    rank, p[0], p[1], p[4], p[2], p[3], p[5], alpha_min, alpha_max, t_stop, width, boxes, let_through,
+                    closed,
+                )  # fmt: skip
     slot_start[len(order)] = entries
     return entries
 

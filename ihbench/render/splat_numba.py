@@ -305,7 +305,7 @@ class _Circles(torch.autograd.Function):
         to_pixels, offset, focal2 = K @ camera.R, K @ camera.t, K[0, 0] * K[1, 1]
         ctx.dtypes = means.dtype, scales.dtype, colors.dtype
         means, scales, colors = _array(means), _array(scales), _array(colors.float())
-        records, depth = np.zeros((n, CIRCLE), f32), np.empty(n, f32)
+        records, depth = np.empty((n, CIRCLE), f32), np.empty(n, f32)
         radius = np.zeros(0 if screen is None else n)
         _run(
             project_circles, means, scales, colors, to_pixels, offset, focal2, preset.low_pass, f32(preset.near),
@@ -323,7 +323,7 @@ class _Circles(torch.autograd.Function):
     def backward(ctx: Any, *grad_outputs: Any) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         drawn, depth, scales, to_pixels, focal2, screen = ctx.saved
         n = len(scales)
-        grads = np.zeros((n, 3), scales.dtype), np.zeros(n, scales.dtype), np.zeros((n, drawn.channels), f32)
+        grads = np.empty((n, 3), scales.dtype), np.empty(n, scales.dtype), np.empty((n, drawn.channels), f32)
         grad_xy = np.zeros((0 if screen is None else n, 2), scales.dtype)
         inputs = depth, scales, to_pixels, focal2
         drawn.backward(grad_outputs, circle_gradients, inputs, (*grads, grad_xy))
