@@ -54,7 +54,7 @@ from ihbench.render.splat_ellipses import (
 )  # fmt: skip
 from ihbench.render.splat_gaussians import gaussian_gradients, project_gaussians
 from ihbench.render.splat_projection import clamped_directions, intrinsics
-from ihbench.render.splat_tiles import OPEN, TILE_HEIGHT, TILE_WIDTH, depth_order, fill_tiles, in_sight
+from ihbench.render.splat_tiles import OPEN, TILE_HEIGHT, TILE_WIDTH, depth_order, fill_tiles, in_sight, ranks_of
 from ihbench.render.splats import PRESETS, Ellipses, Preset, Splats, as_ellipses
 
 if TYPE_CHECKING:
@@ -212,10 +212,7 @@ def _draw_all(
             records[:, at : at + CHANNELS] = 0
             records[:, at : at + here.shape[1]] = here
         passes.append(_draw(elliptic, records, order, preset, bg, size, keep, rgb, alpha))
-    rank_of = np.full(n if keep else 0, -1, np.int32)
-    if keep:
-        rank_of[order] = np.arange(m, dtype=np.int32)
-    return groups, _Drawn(passes, rank_of, channels)
+    return groups, _Drawn(passes, ranks_of(order, n) if keep else np.empty(0, np.int32), channels)
 
 
 @dataclass(frozen=True)

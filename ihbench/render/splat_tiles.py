@@ -71,12 +71,21 @@ def depth_order(order, keys, lowest, highest):
     return order
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def ranks_of(order, n):
+    """[n] int32: the place of each splat in `order` [M], -1 for those not in it."""
+    ranks = np.full(n, -1, np.int32)
+    for rank in range(u64(len(order))):
+        ranks[u64(order[rank])] = rank
+    return ranks
+
+
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def fetch_slots(slots, rank_of, slot_start, packed, i):
     """Ask for what the gradient of splat i + AHEAD is made of."""
     if i + 2 * AHEAD < len(rank_of):
-        prefetch(slot_start, u64(max(rank_of[i + 2 * AHEAD], 0)))
-        rank = u64(max(rank_of[i + AHEAD], 0))
+        prefetch(slot_start, u64(max(rank_of[u64(i + 2 * AHEAD)], 0)))
+        rank = u64(max(rank_of[u64(i + AHEAD)], 0))
         prefetch(packed, rank * u64(packed.shape[1]))
         prefetch(slots, u64(slot_start[rank]) * u64(slots.shape[1]))
 
@@ -147,8 +156,9 @@ def fill_tiles(boxes, tiles_x, tile_start, closed, ranks, slots):
     slot = 0
     for rank in range(len(boxes)):
         box = boxes[u64(rank)]
-        for ty in range(box[2], box[3] + 1):
-            for tx in range(box[0], box[1] + 1):
+        x0, x1, y0, y1 = box[0], box[1], box[2], box[3]
+        for ty in range(y0, y1 + 1):
+            for tx in range(x0, x1 + 1):
                 tile = u64(ty * tiles_x + tx)
                 if rank < closed[tile]:
                     at = cursor[tile]
