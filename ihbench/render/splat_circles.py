@@ -147,7 +147,8 @@ def circle_segments(packed, rank, position, x0, y0, dead, test, prepared, segmen
         across = exp2(zeros() - dx * dx)
         for q in range(row, row_end, 16):
             rows = min(row_end - q, 16)
-            alive |= not hidden(dead, c, min(c + 15, column_end - 1), q, q + rows - 1)
+            if not alive:
+                alive = not hidden(dead, c, min(c + 15, column_end - 1), q, q + rows - 1)
             dy = (lanes() + (f32(q) - y)) * sharp
             store(prepared, n * SEGMENT, across)
             store(prepared, n * SEGMENT + 16, exp2(zeros() - dy * dy))

@@ -113,15 +113,19 @@ def composite_tiles(
                 tile[q * FORWARD_ROW + j] = ONE
         first_x, first_y = f32(x0) + HALF, f32(y0) + HALF
         k = begin
-        while k < end and find_dead(tile, t_stop, dead):
+        while k < end:
+            cells = find_dead(tile, t_stop, dead)
+            if cells == 0:
+                break
+            some = cells < CELLS_X * CELLS_Y  # else nothing is hidden, and no splat is asked
             n, batch_end = 0, min(k + BATCH, end)
             while k < batch_end and n < SEGMENTS - MOST:
-                rank = u64(ranks[k])
+                rank = u64(ranks[u64(k)])
                 if elliptic is None:
-                    after = circle_segments(packed, rank, live, first_x, first_y, dead, True, prepared, segments, n)
+                    after = circle_segments(packed, rank, live, first_x, first_y, dead, some, prepared, segments, n)
                 else:
-                    after = ellipse_segments(packed, rank, live, first_x, first_y, dead, True, prepared, segments, n)
-                ranks[begin + live], slots[begin + live] = ranks[k], slots[k]
+                    after = ellipse_segments(packed, rank, live, first_x, first_y, dead, some, prepared, segments, n)
+                ranks[u64(begin + live)], slots[u64(begin + live)] = ranks[u64(k)], slots[u64(k)]
                 live += after > n
                 n = after
                 k += 1
@@ -217,7 +221,7 @@ def composite_tiles_backward(
         while k >= 0:
             n, batch_end = 0, max(k - BATCH, -1)
             while k > batch_end and n < SEGMENTS - MOST:
-                rank = u64(ranks[begin + k])
+                rank = u64(ranks[u64(begin + k)])
                 if elliptic is None:
                     n = circle_segments(packed, rank, k, first_x, first_y, dead, False, prepared, segments, n)
                 else:

@@ -162,7 +162,8 @@ def ellipse_segments(packed, rank, position, x0, y0, dead, test, prepared, segme
             continue
         column = np.int32(-largest(select(inside, zeros() - start, zeros() - right)))
         column_end = np.int32(largest(select(inside, end, zeros())))
-        alive |= column_end - column > 16 or not hidden(dead, column, column_end - 1, q, q + rows - 1)
+        if not alive:
+            alive = column_end - column > 16 or not hidden(dead, column, column_end - 1, q, q + rows - 1)
         for shift in range(0, widest, 16):
             at = smaller(start + f32(shift), right)
             store(prepared, n * SEGMENT, at)
