@@ -152,8 +152,8 @@ def circle_segments(packed, rank, position, x0, y0, dead, test, prepared, segmen
             dy = (lanes() + (f32(q) - y)) * sharp
             store(prepared, n * SEGMENT, across)
             store(prepared, n * SEGMENT + 16, exp2(zeros() - dy * dy))
-            segments[n, 0], segments[n, 1], segments[n, 2] = c, q, rows
-            segments[n, 3], segments[n, 4] = rank, position
+            segment = segments[u64(n)]
+            segment[0], segment[1], segment[2], segment[3], segment[4] = c, q, rows, rank, position
             n += 1
     return n if alive else before
 

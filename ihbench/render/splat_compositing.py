@@ -280,7 +280,7 @@ def composite_tiles_backward(
                         dy += ONE
                     sr, sg, sb = sr + weight * gr, sg + weight * gg, sb + weight * gb
                     row += BACKWARD_ROW
-                e = gradients[u64(slots[begin + segments[s, 4]])]
+                e = gradients[u64(slots[u64(begin + segments[s, 4])])]
                 if elliptic is None:
                     dx = lanes() + (f32(segments[s, 0]) - (packed[rank, 0] - first_x))  # the same in every row
                     sx = s0 * dx

@@ -169,7 +169,8 @@ def ellipse_segments(packed, rank, position, x0, y0, dead, test, prepared, segme
             store(prepared, n * SEGMENT, at)
             store(prepared, n * SEGMENT + 16, packed[rank, 5] - down)
             store(prepared, n * SEGMENT + 32, at - ridge)
-            segments[n, 1], segments[n, 2], segments[n, 3], segments[n, 4] = q, rows, rank, position
+            segment = segments[u64(n)]
+            segment[1], segment[2], segment[3], segment[4] = q, rows, rank, position
             n += 1
     return n if alive else before
 
