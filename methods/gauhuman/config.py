@@ -25,7 +25,7 @@ STATIC_DEG = 5.0  # below this no joint moves, and no network learns anything fr
 ONE_SIDE_DEG = 10.0  # a person who turns by less is seen from one direction: colours by direction are one colour
 NOTHING_HIDDEN = 0.002  # share of the texels that no frame shows although one faces them; fewer are specks
 
-# shares of a step's time, measured at the quick profile
+# shares of a step's time, estimated
 POSE_SHARE = 0.03
 DIRECTION_SHARE = 0.01
 
