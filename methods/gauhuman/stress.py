@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,10 +21,15 @@ from ihbench.methods.gauhuman.config import OCCLUDED, SMOKE, GauHumanConfig
 from ihbench.methods.gauhuman.method import GauHuman
 from ihbench.scene.contracts import MaskState, TrainingSet, TrainView
 from ihbench.stress.case import Answer, Case, words_of
-from ihbench.stress.drawn_capture import WHITE, a_camera, a_pose, the_body, train_view
+from ihbench.stress.six_views import (
+    all_unknown,
+    training_set,
+    views,
+    with_bad_hidden_pixels,
+    with_bad_pixel,
+)
 from ihbench.stress.training import story_of_fit
 
-SIZE = 48  # px
 # changes of the set after 12 and 15 of 18 steps; no reset, which so few steps do not outlive; without the network of
 # the weights, which takes most of a step's time
 TINY = replace(
@@ -41,26 +46,6 @@ RATES = ("lr_position", "lr_scale", "lr_rotation", "lr_opacity", "lr_colour", "l
 HELPS = "the error of alpha over the views after the fit, over that before: a fit that does not lower it is none"
 STEP = "a step is counted"
 REFUSED = "it must be refused, and the line must say this"
-
-
-@cache
-def views() -> tuple[TrainView, ...]:
-    """Six sides of a person who bends; every other view has a strip."""
-    return tuple(
-        train_view(
-            a_camera(0.0, SIZE), a_pose(1.05 * k, 0.3 * math.sin(k)), slice(21, 27) if k % 2 else None, frame=k
-        )
-        for k in range(6)
-    )
-
-
-def training_set(shown: Sequence[TrainView] | None = None) -> TrainingSet:
-    return TrainingSet(list(views() if shown is None else shown), the_body(), WHITE, "stress")
-
-
-def a_person_pixel(k: int) -> tuple[int, ...]:
-    """Row and column of one, in view k."""
-    return tuple(np.argwhere(views()[k].mask == MaskState.PERSON)[9])
 
 
 def fit(config: GauHumanConfig, training: TrainingSet | None = None, ledger: Ledger | None = None) -> Any:
@@ -114,8 +99,7 @@ def _survives(factor: float) -> Answer:
 
 def _empty_mask(**changes: Any) -> Answer:
     """Views in which the person is wholly hidden, among others."""
-    hidden = [replace(view, mask=np.full_like(view.mask, MaskState.UNKNOWN)) for view in views()[1:3]]
-    return _ratio(replace(TINY, **changes), training_set([views()[0], *hidden, *views()[3:]]))
+    return _ratio(replace(TINY, **changes), training_set([views()[0], *all_unknown()[1:3], *views()[3:]]))
 
 
 def _nothing(shown: Sequence[TrainView]) -> Answer:
@@ -128,19 +112,14 @@ def _all_pruned() -> Answer:
 
 def _bad_pixel(bad: float) -> Answer:
     """One pixel of one view is not finite; smaller steps cannot help, so none is tried."""
-    image = views()[2].image.astype(np.float32)
-    image[a_person_pixel(2)] = bad
-    shown = [replace(view, image=image) if k == 2 else view for k, view in enumerate(views())]
-    after, what = story(TINY, training_set(shown))
+    after, what = story(TINY, with_bad_pixel(2, bad))
     assert after is None
     return Answer(what, "loss is ")
 
 
 def _hidden_bad_pixel() -> Answer:
     """A NaN behind the occluder is nobody's business."""
-    image = views()[1].image.astype(np.float32)
-    image[views()[1].mask == MaskState.UNKNOWN] = math.nan
-    return _ratio(TINY, training_set([replace(views()[1], image=image), *views()[2:]]))
+    return _ratio(TINY, with_bad_hidden_pixels(1, math.nan))
 
 
 def _one_gaussian() -> Answer:
@@ -174,7 +153,7 @@ CASES = [
     _helps("empty-mask", "two frames without a visible pixel", partial(_empty_mask, unknown="ignore")),
     _refused("no-view", "no training view", partial(_nothing, [])),
     _refused("all-hidden", "views without a visible pixel",
-             lambda: _nothing([replace(v, mask=np.full_like(v.mask, MaskState.UNKNOWN)) for v in views()])),
+             lambda: _nothing(all_unknown())),
     _step("all-pruned", "an opacity of 1 is asked of every Gaussian", _all_pruned),
     _step("nan-pixel", "a NaN among the person's pixels", partial(_bad_pixel, math.nan)),
     _step("inf-pixel", "an infinite person pixel", partial(_bad_pixel, math.inf)),
