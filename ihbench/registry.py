@@ -27,6 +27,7 @@ GROUPS = {
     "report": "ihbench.reports",
     "report verb": "ihbench.report_verbs",
     "figure": "ihbench.figures",
+    "paper figure": "ihbench.paper_figures",
     "metric preset": "ihbench.presets",
 }
 

@@ -10,6 +10,7 @@ COMMANDS = {
     "prepare": "hand out the occluded training set for other people's code",
     "ablate": "what each component of a method is worth, in quality and in seconds",
     "report": "tables of finished runs, and error against run time",
+    "figures": "figures as papers have them, from finished runs: PNG, PDF and the caption",
     "runs": "list the runs in a folder, one line each; remove some",
     "metrics": "check every metric against oracles, other libraries and stored values",
     "weights": "learned weights the bench may not ship: list, where, fetch",

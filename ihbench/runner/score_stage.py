@@ -120,10 +120,7 @@ def render_path(folder: RunFolder, loaded: LoadedView) -> Path:
 
 
 def _sheet_row(scene: OccludedScene, loaded: LoadedView, image: NDArray | None) -> SheetRow:
-    protocol, capture = scene.protocol, scene.capture
-    frames = protocol.training_frames(capture.name, capture.n_frames)
-    nearest = min(range(len(frames)), key=lambda k: abs(frames[k] - loaded.key.frame))
     truth = loaded.view.image
     shown = np.zeros_like(truth) if image is None else (displayed(image) / 255).astype(np.float32)
     label = loaded.key.name + (" (no prediction)" if image is None else "")
-    return SheetRow(label, scene.train[nearest].image, truth, shown, loaded.view.hidden)
+    return SheetRow(label, scene.nearest_training(loaded.key.frame).image, truth, shown, loaded.view.hidden)

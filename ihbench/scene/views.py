@@ -125,6 +125,11 @@ class OccludedScene:
         """What the method gets."""
         return TrainingSet(self.train, self.capture.model, self.protocol.image.background, self.capture.name)
 
+    def nearest_training(self, frame: int) -> TrainView:
+        """The training view of about the moment of a frame."""
+        frames = self.protocol.training_frames(self.capture.name, self.capture.n_frames)
+        return self.train[min(range(len(frames)), key=lambda k: abs(frames[k] - frame))]
+
 
 def straight_camera(camera: Camera, rule: ImageRule) -> Camera:
     """The camera of the protocol's images of this camera."""

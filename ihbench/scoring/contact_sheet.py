@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 
 from ihbench.metrics.eight_bit import as_float, displayed
 from ihbench.metrics.images import as_image, bounds, check_images, grown
+from ihbench.scene.contracts import MaskState, TrainView
 
 COLUMNS = ("training input", "truth", "prediction", "error x4")
 PAD, LABEL = 6, 18  # px
 GREY = 70
+OCCLUDER = 168
 
 
 @dataclass(frozen=True)
@@ -61,9 +63,8 @@ def contact_sheet(rows: Sequence[SheetRow], title: str, zoom: int = 1) -> NDArra
         if row.hidden is not None:
             truth[row.hidden] = error[row.hidden] = GREY
         images = (row.training, truth, displayed(row.prediction), error)
-        windows = _window_of(displayed(row.truth)), _window_of(displayed(row.prediction))
-        window = tuple(slice(min(a.start, b.start), max(a.stop, b.stop)) for a, b in zip(*windows, strict=True))
-        cut = [images[0][_window_of(row.training)]] + [image[window] for image in images[1:]]
+        window = common_window([displayed(row.truth), displayed(row.prediction)])
+        cut = [images[0][picture_window(row.training)]] + [image[window] for image in images[1:]]
         cells.append([image.repeat(zoom, 0).repeat(zoom, 1) for image in cut])
     height = max(cell.shape[0] for line in cells for cell in line)
     width = max(110, *(cell.shape[1] for line in cells for cell in line))
@@ -82,7 +83,22 @@ def contact_sheet(rows: Sequence[SheetRow], title: str, zoom: int = 1) -> NDArra
     return np.asarray(sheet)
 
 
-def _window_of(image: NDArray[np.uint8], margin: int = 4) -> tuple[slice, slice]:
-    """The part of an image that differs from its corner's colour."""
+def with_occluder(view: TrainView) -> NDArray[np.uint8]:
+    """[H, W, 3] a training image with what the occluder hides in grey: on white it would look like background."""
+    return np.where((view.mask == MaskState.UNKNOWN)[..., None], np.uint8(OCCLUDER), view.image)
+
+
+def picture_window(image: NDArray[np.uint8], margin: int = 4) -> tuple[slice, slice]:
+    """Rows and columns of an image [H, W, 3] that differ from its corner's colour; all of them where none does."""
     area = bounds((np.abs(image.astype(int) - image[0, 0].astype(int)) > 8).any(-1))
     return grown(area or (slice(0, image.shape[0]), slice(0, image.shape[1])), margin, image.shape)
+
+
+def common_window(images: Sequence[NDArray[np.uint8]]) -> tuple[slice, slice]:
+    """The smallest window that holds the windows of several images of one size."""
+    rows, columns = zip(*map(picture_window, images), strict=True)
+
+    def whole(along: Sequence[slice]) -> slice:
+        return slice(min(s.start for s in along), max(s.stop for s in along))
+
+    return whole(rows), whole(columns)

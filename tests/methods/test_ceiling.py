@@ -13,9 +13,13 @@ from ihbench.document.document import write
 from ihbench.methods.inpainthuman.inpainting.painted_view import PaintedView
 from ihbench.methods.inpainthuman.studies.ceiling import CeilingRow, painted_psnr, with_truth
 from ihbench.methods.inpainthuman.studies.ceiling_command import table
+from ihbench.methods.inpainthuman.studies.grid import HIDDEN
+from ihbench.methods.inpainthuman.studies.inpaint_figure import inpaint
 from ihbench.metrics import Identity
+from ihbench.record.finished_run import FinishedRun
 from ihbench.record.results import read_result
 from ihbench.scene.contracts import MaskState, TrainView
+from ihbench.scoring.contact_sheet import OCCLUDER
 from tests.bench.fake_capture import a_camera, a_pose
 from tests.conftest import TINY_SWITCHES
 
@@ -78,6 +82,19 @@ def test_a_run_between_its_first_stage_and_its_ceiling(bench, tmp_path):
                 assert value == pytest.approx(own[Identity.parse(identity)].value, abs=1e-6), (name, identity)
     assert rows["true images"]["painted_psnr"] == "inf"
     assert 3 < rows["as painted"]["painted_psnr"] < 40
+    with bench.in_its_world():
+        sheet = inpaint([FinishedRun(run)], views=1)
+    assert files_of(run) == before
+    ((head, panels),) = sheet.rows
+    assert head.startswith("standin-1, frame ")
+    filmed, asked, painted, truth = (panel.image.astype(int) for panel in panels)
+    made = (asked == HIDDEN).all(-1)
+    assert made.any()
+    assert (filmed[made] == OCCLUDER).all(), "painted where something is hidden"
+    assert (painted[made] != OCCLUDER).any()
+    assert np.array_equal(painted[~made], filmed[~made])
+    assert panels[3].note.startswith("painted: ")
+    assert not np.array_equal(truth[made], painted[made])
     hidden = [
         identity for identity in rows["as painted"]["scores"] if identity.startswith("psnr/pooled/range1/hidden")
     ]

@@ -40,7 +40,7 @@ class Stage2:
 
     def run(self, progress: Progress) -> list[PaintedView]:
         """The views that stage 3 learns from besides the training views; none where nothing needs painting."""
-        saved = self._restored()
+        saved = saved_paintings(self.ledger)
         if saved is not None:
             return saved
         with self.ledger.stage("look"):
@@ -178,22 +178,24 @@ class Stage2:
         rows = [[view.index, view.view.frame, view.view.camera_id] for view in painted]
         self.ledger.save_state(STATE, tensors, {"views": rows})
 
-    def _restored(self) -> list[PaintedView] | None:
-        from ihbench.body.pose import BodyPose
-        from ihbench.camera import Camera
 
-        saved = self.ledger.load_state(STATE)
-        if saved is None:
-            return None
-        tensors, meta = saved
-        out = []
-        for n, (index, frame, camera_id) in enumerate(meta["views"]):
-            part = {name: np.asarray(tensors[f"{n}.{name}"]) for name in
-                    ("image", "mask", "generated", "K", "R", "t", "pose", "betas", "transl")}  # fmt: skip
-            height, width = part["mask"].shape
-            camera = Camera(part["K"], part["R"], part["t"], width, height)
-            pose = BodyPose(part["pose"], part["betas"], part["transl"])
-            view = TrainView(part["image"], part["mask"], camera, pose, int(frame), str(camera_id))
-            out.append(PaintedView(int(index), view, part["generated"].astype(bool)))
-        self.ledger.event(Resumed(STATE, len(out)))
-        return out
+def saved_paintings(ledger: Ledger) -> list[PaintedView] | None:
+    """What a run has painted, from its saved state; None where there is none, or a damaged one."""
+    from ihbench.body.pose import BodyPose
+    from ihbench.camera import Camera
+
+    saved = ledger.load_state(STATE)
+    if saved is None:
+        return None
+    tensors, meta = saved
+    out = []
+    for n, (index, frame, camera_id) in enumerate(meta["views"]):
+        part = {name: np.asarray(tensors[f"{n}.{name}"]) for name in
+                ("image", "mask", "generated", "K", "R", "t", "pose", "betas", "transl")}  # fmt: skip
+        height, width = part["mask"].shape
+        camera = Camera(part["K"], part["R"], part["t"], width, height)
+        pose = BodyPose(part["pose"], part["betas"], part["transl"])
+        view = TrainView(part["image"], part["mask"], camera, pose, int(frame), str(camera_id))
+        out.append(PaintedView(int(index), view, part["generated"].astype(bool)))
+    ledger.event(Resumed(STATE, len(out)))
+    return out

@@ -68,7 +68,7 @@ def ceiling(
     scorer = Scorer.build(scene)
     rows = []
     with TemporaryDirectory() as copy:
-        ledger = _lent(folder, Path(copy))
+        ledger = lent(folder, Path(copy), STATES)
 
         def stage1() -> GaussianAvatar:
             avatar = GaussianAvatar(fitted.config, model, fitted.betas, seed).to(device)
@@ -116,10 +116,10 @@ def painted_psnr(painted: Sequence[PaintedView], whole: Sequence[TrainView]) -> 
     return math.inf if squares == 0 else 10 * math.log10(255**2 * count / squares)
 
 
-def _lent(folder: Path, copy: Path) -> Ledger:
-    """A ledger with copies of the run's states: what is done with it leaves the run as it is."""
+def lent(folder: Path, copy: Path, states: Sequence[str]) -> Ledger:
+    """A ledger with copies of some of the run's states: what is done with it leaves the run as it is."""
     (copy / "checkpoints").mkdir()
-    for state in STATES:
+    for state in states:
         shutil.copyfile(state_file(folder, state), state_file(copy, state))
     return Ledger(copy)
 

@@ -1,0 +1,1 @@
+"""Figures as papers have them, from finished runs."""
