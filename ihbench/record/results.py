@@ -294,6 +294,7 @@ def summary(results: Iterable[RunResult]) -> dict[str, object]:
                 "fit_seconds": r.about.fit_seconds,
                 "total_seconds": r.about.total_seconds,
                 "peak_mb": r.about.peak_mb,
+                "render_ms": r.about.render_ms,
                 **({} if r.about.predictions is None else {"predictions": as_json(r.about.predictions)}),
             }
             for r in results

@@ -171,6 +171,7 @@ class About:
     fit_seconds: Seconds | None = None
     total_seconds: Seconds | None = None
     peak_mb: Megabytes | None = None
+    render_ms: Annotated[float, Within(0)] | None = None  # of one test view, the median; see `RenderClock`
     more: Json = field(default_factory=dict)
 
     @property

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, fields
 from dataclasses import field as dataclass_field
 from functools import cached_property
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -118,13 +120,34 @@ def run_identity(request: RunRequest, capture: Capture, body: Body) -> RunIdenti
     return identity_of(request.protocol, capture, body, request.method, config, request.seed, code)
 
 
-def load_avatar(run: FinishedRun) -> Any:
+def load_avatar(run: FinishedRun, device: str = "cpu") -> Any:
     """The avatar of a run. Raises `BadInput` where it has none."""
     if not (run.folder / "avatar").is_dir():
         raise BadInput(f"{run.folder}: has no avatar (status {run.record.outcome.status}); finish the run first")
     identity = run.record.identity
     spec = method_spec(identity.method)
-    return spec.create(spec.profile(identity.profile)).load(run.folder / "avatar", run.body)
+    return spec.create(spec.profile(identity.profile)).load(run.folder / "avatar", run.body, device)
+
+
+class RenderClock:
+    """Milliseconds that an avatar takes to draw a view: from the call until the image is there, on the device too;
+    without reading or writing files. Scoring goes on beside it on other threads, as it does in every run."""
+
+    def __init__(self) -> None:
+        self.milliseconds: list[float] = []
+
+    @contextmanager
+    def timing(self, device: str) -> Iterator[None]:
+        machine.synchronize(device)
+        start = time.perf_counter()
+        yield
+        machine.synchronize(device)
+        self.milliseconds.append(1000 * (time.perf_counter() - start))
+
+    @property
+    def median_ms(self) -> float | None:
+        """None where nothing was drawn."""
+        return round(median(self.milliseconds), 3) if self.milliseconds else None
 
 
 class _Run(RecordedRun):
@@ -181,9 +204,10 @@ class _Run(RecordedRun):
             avatar.save(self.folder.path / "avatar")
         self.folder.set_status("running", ledger=self.ledger)
         with self.ledger.stage("score"):
+            clock = RenderClock()
             stage = ScoreStage(self.scorer, self.folder, request.runs, self.progress, request.force)
-            stage.run(request.method, lambda loaded: self._render(avatar, loaded.view))
-        self.describe()
+            stage.run(request.method, lambda loaded: self._render(avatar, loaded.view, clock))
+        self.describe(render_ms=clock.median_ms)
         self.folder.set_status("done", ledger=self.ledger)
 
     def _take_shared_states(self) -> None:
@@ -197,10 +221,11 @@ class _Run(RecordedRun):
                 self.ledger.events += reuse_state(other, self.folder, state)  # that it went back, say
                 self.ledger.event(Reused(state, other.record.digest))
 
-    def _render(self, avatar: Avatar, view: TestView) -> NDArray[np.float32]:
+    def _render(self, avatar: Avatar, view: TestView, clock: RenderClock | None = None) -> NDArray[np.float32]:
         background, frames = self.request.protocol.image.background, self.occluded.hiding.frames
         frame = view.frame if view.frame in frames else None  # whose pose it has: the capture has one a frame
-        return avatar.render(view.camera, view.body_pose, background, frame)[0]
+        with nullcontext() if clock is None else clock.timing(self.request.device):
+            return avatar.render(view.camera, view.body_pose, background, frame)[0]
 
     def _curve_point(self, step: int, seconds: float, avatar: Avatar) -> None:
         """Score a checkpoint on a few fixed test views. The fit clock stands still meanwhile."""

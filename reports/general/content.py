@@ -177,7 +177,7 @@ def _table(
         f"{name} ({i.variant})" if names.count(name) > 1 else name for i, name in zip(columns, names, strict=True)
     ]
     titles: list[Words] = [strong(t) if i.region == headline else t for i, t in zip(columns, names, strict=True)]
-    costs = ["fit s", "total s", "peak MB"] if with_costs else []
+    costs = ["fit s", "total s", "peak MB", "render ms"] if with_costs else []
     head: list[Words] = ["method", "scenes", "seeds", *titles, *costs]
     lines: list[tuple[Words, ...]] = []
     for label, group in by_label(runs).items():
@@ -188,6 +188,7 @@ def _table(
             alike = one_clock(group)  # seconds of several machines have no mean
             own = [_mean_of(group, name) if alike else "—" for name in ("fit_seconds", "total_seconds")]
             own.append(f"{max(run.about.peak_mb or 0.0 for run in group):.0f}")
+            own.append(_mean_of(group, "render_ms", "{:.3g}") if alike else "—")
         lines.append((label, *about, *score_cells(group, columns, method), *own))
         for row in further_rows(group):
             name = label + row.removeprefix(method)
@@ -201,9 +202,9 @@ def _table(
     return Table(tuple(head), tuple(lines), left=3)
 
 
-def _mean_of(runs: list[RunResult], key: str) -> str:
+def _mean_of(runs: list[RunResult], key: str, shown: str = "{:.0f}") -> str:
     known = [value for run in runs if (value := getattr(run.about, key)) is not None]
-    return f"{sum(known) / len(known):.0f}" if known else "—"
+    return shown.format(sum(known) / len(known)) if known else "—"
 
 
 def _remarks(runs: list[RunResult]) -> list[str]:

@@ -43,6 +43,7 @@ def made_up(
     events=(),
     views=3,  # test views that the curve stands on
     of=None,  # of how many; None as runs of earlier versions, which do not say
+    render_ms=None,  # None as runs of earlier versions, which do not say
     stamped=None,  # s between the record's time stamps; None agrees with the ledger
 ) -> RunResult:
     """A run whose regions all have the same PSNR, and FLIP = 10 / PSNR. Its folder holds nothing but the curve."""
@@ -79,7 +80,7 @@ def made_up(
     )
     said = About(
         standin=standin, variant="v", headline="body", changed=changed or {}, left_out=(), fit_seconds=fit,
-        total_seconds=wall, peak_mb=100.0, device=device, protocol={"image": {"size": size}},
+        total_seconds=wall, peak_mb=100.0, render_ms=render_ms, device=device, protocol={"image": {"size": size}},
     )  # fmt: skip
     told = replace(
         record(who, said, machine=replace(QUIET, **(machine or {}))),

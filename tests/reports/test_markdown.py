@@ -136,6 +136,9 @@ def test_calibration_rows_count_every_scene_once_and_stand_below_the_methods():
 def test_seconds_are_means_and_memory_is_the_largest():
     cells = row(write([run(fit_seconds=10, peak_mb=100), run("b", fit_seconds=30, peak_mb=300)]), "ours")
     assert (cells["fit s"], cells["total s"], cells["peak MB"]) == ("20", "20", "300")
+    assert cells["render ms"] == "—"  # of runs whose records do not say
+    cells = row(write([run(render_ms=12.04), run("b", render_ms=16.0), run("c")]), "ours")
+    assert cells["render ms"] == "14"
 
 
 # ------------------------------------------------------------------------------------------- what is said

@@ -51,6 +51,14 @@ def test_seconds_are_means_over_scenes_with_an_interval_and_one_scene_takes_its_
     assert cells(section(repeats[:1]), "ours")["fit s"] == "38"
 
 
+def test_render_ms_is_the_mean_over_scenes_of_those_that_say(tmp_path):
+    runs = [made_up(tmp_path, "a", render_ms=10.0, seed=0), made_up(tmp_path, "a", render_ms=14.0, seed=1)]
+    runs += [made_up(tmp_path, "b", render_ms=20.0), *(made_up(tmp_path, s, "theirs") for s in "ab")]
+    text = section(runs)
+    assert cells(text, "ours")["render ms"] == "16"
+    assert cells(text, "theirs")["render ms"] == "—"
+
+
 def test_the_pareto_marks_are_those_of_the_numbers_in_the_table(tmp_path):
     text = section(sweep(tmp_path))
     marks = {

@@ -2,6 +2,7 @@
 
 import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from ihbench.methods.inpainthuman.config import QUICK
 from ihbench.methods.inpainthuman.method import InpaintHuman
 from ihbench.metrics import psnr
 from ihbench.record.results import read_result
+from ihbench.runner import run_loop
 from ihbench.scene.contracts import MaskState
 from ihbench.scene.data_source import locate
 from ihbench.scene.protocol import load_protocol
@@ -288,6 +290,27 @@ def test_the_plan_leaves_alone_what_somebody_has_set(finished):
     """The finished run names its levels, of which the second is finer than its images."""
     assert read_json(finished.folder / "run.json")["about"]["left_out"] == []
     assert read_json(finished.folder / "avatar" / "avatar.json")["config"]["levels"] == [16, 256]
+
+
+def test_drawing_is_timed_for_every_test_view_and_the_median_is_kept(bench, mannequin, monkeypatch):
+    """By a clock that only the avatar moves."""
+    from own_method.method import MannequinAvatar
+
+    now, took = [0.0], iter([0.001, 0.009, 0.002, 0.004])
+    draw = MannequinAvatar.render
+
+    def slow(self, camera, body_pose, background, frame):
+        now[0] += next(took, 0.0)
+        return draw(self, camera, body_pose, background, frame)
+
+    monkeypatch.setattr(MannequinAvatar, "render", slow)
+    monkeypatch.setattr("ihbench.clock.ledger.Ledger.offer", lambda *_, **__: None)  # the curve draws, too
+    monkeypatch.setattr(run_loop, "time", SimpleNamespace(perf_counter=lambda: now[0], process_time=lambda: 0.0))
+    outcome = bench.run("--json", method=mannequin)
+    assert outcome.status == 0
+    (folder,) = bench.folders()
+    assert read_json(folder / "run.json")["about"]["render_ms"] == 3.0
+    assert json.loads(outcome.out)["runs"][0]["render_ms"] == 3.0
 
 
 @pytest.mark.parametrize("kept", ["levels", "all"])
