@@ -21,6 +21,7 @@ GROUPS = {
     "stand-in": "ihbench.standins",
     "training layout": "ihbench.training_layouts",
     "people": "ihbench.people",
+    "motion": "ihbench.motions",
     "table": "ihbench.tables",
     "protocol": "ihbench.protocols",
     "occlusion": "ihbench.occlusions",
@@ -37,6 +38,7 @@ NEEDS = {  # attributes of what is registered
     "dataset": ("check",),
     "stand-in": ("version", "protocol", "subjects", "ensure", "n_frames", "n_cameras"),
     "metric preset": ("about", "source", "measures"),
+    "motion": ("seconds", "motion"),
 }
 
 

@@ -63,7 +63,7 @@ def turntable(rng: np.random.Generator, n_frames: int, turns: float) -> Performa
     sway = np.sin(2 * np.pi * (3 * t + rng.uniform()))
     yaw = 2 * np.pi * turns * t + np.deg2rad(4) * sway * np.minimum(1, 20 * t)
     phase = 2 * np.pi * 2 * t
-    pose = _standing(phase)
+    pose = standing(phase)
     lift = 12 + 5 * np.sin(phase + rng.uniform(0, 2 * np.pi))
     _turn_both(pose, "shoulder", z=lift)
     pose = pose + _stepping(yaw) + 0.5 * _restlessness(rng, n_frames)
@@ -86,7 +86,7 @@ def stroll(rng: np.random.Generator, n_frames: int, reach: float) -> Performance
     walking = gaussian_filter1d((np.abs(going) > 0.006).astype(float), 3, mode="nearest")
     heading = np.interp(t, [0, 0.34, 0.4, 0.6, 0.66, 0.9, 0.97, 1], np.pi / 2 * np.array([1, 1, 0, 0, 1, 1, 0, -0.6]))
     stride = np.cumsum(np.abs(going)) * 2 * np.pi / 1.25  # a double step of 1.25 m
-    pose = _standing(stride)
+    pose = standing(stride)
     for s, lead in ((1, "left"), (-1, "right")):
         swing = s * np.sin(stride) * walking
         _turn(pose, f"{lead}_hip", x=-26 * swing)
@@ -231,7 +231,7 @@ def _turn_both(pose: Array, joint: str, x: Array | float = 0, y: Array | float =
     _turn(pose, f"right_{joint}", x, -np.asarray(y), -np.asarray(z))
 
 
-def _standing(phase: Array) -> Array:
+def standing(phase: Array) -> Array:
     """Arms hanging a little away from the body, knees soft."""
     pose = _still(len(phase))
     _turn_both(pose, "shoulder", z=-62)
@@ -244,7 +244,7 @@ def _standing(phase: Array) -> Array:
 
 def _arm_swing(phase: Array) -> Array:
     s, up = np.sin(phase), 0.5 - 0.5 * np.cos(phase)
-    pose = _standing(phase)
+    pose = standing(phase)
     _turn_both(pose, "shoulder", z=42 * up)
     for side, sign in (("left", 1), ("right", -1)):
         _turn(pose, f"{side}_shoulder", y=-38 * s * sign)
@@ -257,7 +257,7 @@ def _arm_swing(phase: Array) -> Array:
 
 
 def _kick(phase: Array) -> Array:
-    pose = _standing(phase)
+    pose = standing(phase)
     for side, other, lift in (("right", "left", np.sin(phase / 2)), ("left", "right", -np.sin(phase / 2))):
         lift = np.maximum(lift, 0) ** 1.6
         sign = 1 if other == "left" else -1
@@ -273,7 +273,7 @@ def _kick(phase: Array) -> Array:
 
 def _twist(phase: Array) -> Array:
     s = np.sin(phase)
-    pose = _standing(phase)
+    pose = standing(phase)
     _turn(pose, "spine1", y=18 * s)
     _turn(pose, "spine2", y=16 * s)
     _turn(pose, "spine3", y=10 * s, z=4 * np.cos(phase))
@@ -286,7 +286,7 @@ def _twist(phase: Array) -> Array:
 
 
 def _wave(phase: Array) -> Array:
-    pose = _standing(phase)
+    pose = standing(phase)
     sway = np.sin(phase / 2)
     _turn(pose, "right_shoulder", y=8, z=-64 + 6 * np.sin(phase))
     _turn(pose, "right_elbow", y=10 + 8 * np.sin(2 * phase), z=-48 + 28 * np.sin(2 * phase))
@@ -301,7 +301,7 @@ def _wave(phase: Array) -> Array:
 
 def _punch(phase: Array) -> Array:
     """Straight punches, left and right in turn, one foot ahead."""
-    pose = _standing(phase)
+    pose = standing(phase)
     _turn(pose, "left_hip", x=-14)
     _turn(pose, "left_knee", x=10)
     _turn(pose, "right_hip", x=10)
@@ -318,7 +318,7 @@ def _punch(phase: Array) -> Array:
 
 def _march(phase: Array) -> Array:
     """Knees high in turn, the opposite arm bent forwards."""
-    pose = _standing(phase)
+    pose = standing(phase)
     for side, other, lift in (("left", "right", np.sin(phase)), ("right", "left", -np.sin(phase))):
         lift = np.maximum(lift, 0) ** 1.3
         sign = 1 if other == "left" else -1
@@ -355,7 +355,7 @@ BENT: dict[str, tuple[float, dict[str, tuple[float, float, float]]]] = {
 def _bend(name: str, phase: Array) -> Array:
     power, angles = BENT[name]
     amount = (0.5 - 0.5 * np.cos(phase)) ** power
-    pose = _standing(phase)
+    pose = standing(phase)
     for joint, (x, y, z) in angles.items():
         turn = _turn if joint in JOINT_INDEX else _turn_both
         turn(pose, joint, x * amount, y * amount, z * amount)

@@ -14,6 +14,7 @@ COMMANDS = {
     "runs": "list the runs in a folder, one line each; remove some",
     "metrics": "check every metric against oracles, other libraries and stored values",
     "weights": "learned weights the bench may not ship: list, where, fetch",
+    "render": "an avatar turned around, moved, beside others: WebP, GIF, WebM, MP4 or PNG frames",
     "export": "an avatar's Gaussians as a splat PLY",
     "stress": "stiff and extreme cases with known answers, case by case",
     "kernels": "error against milliseconds for the bench's own kernels",

@@ -33,7 +33,8 @@ BENCH = Path(__file__).resolve().parents[1]
 # of the bench: commands, what only shows or checks numbers, and the rooms, which are asked for one by one
 NOT_IN_NUMBERS = (
     *(f"{room}/*" for room in registry.ROOMS),
-    "commands/*", "kernels/*", "stress/*", "__main__.py", "cli.py", "clock/progress.py", "errors.py", "registry.py",
+    "commands/*", "kernels/*", "stress/*", "show/*", "export/*",
+    "__main__.py", "cli.py", "clock/progress.py", "errors.py", "registry.py",
     "runner/ablation.py", "runner/executor.py", "record/index.py", "record/quality_time.py",
     "record/frame.py", "record/scene_means.py", "record/row_choice.py", "record/row_labels.py",
     "scoring/contact_sheet.py", "document/*", "files/splat_ply.py",

@@ -18,7 +18,7 @@ BELOW = (
 )  # of the root, what every storey may use
 STOREYS = (
     *("files", "clock", "render", "body", "nets", "metrics", "document", "scene", "fit", "diffusion"),
-    *("scoring", "record", "data", "runner", "kernels", "stress", "commands"),
+    *("scoring", "record", "data", "runner", "show", "export", "kernels", "stress", "commands"),
 )
 MOST_IN_ROOT, MOST_IN_FOLDER = 10, 17  # modules, `__init__` and `__main__` apart
 
