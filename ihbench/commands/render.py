@@ -47,6 +47,9 @@ class RenderOptions:
     size: Annotated[tuple[Annotated[int, Within(*IMAGE_SIZES)], ...], Entries(0, 2)] = ()
     """px: a side, or width and height (default 512). Of data sets' cameras and paths the longer side (default: their
     own)."""
+    sharp: bool = False
+    """Draw finer than the training images, too. Methods that learn points then show gaps between them; without it,
+    what is drawn larger is enlarged."""
     fps: Annotated[float | None, Within(0.5, 240)] = None
     """Frames per second; a path's own, else 25."""
     elevation: Annotated[float, Within(-80, 80)] = 8.0
@@ -86,7 +89,7 @@ def main(argv: list[str]) -> int:
     groups = [subjects] if chosen.side_by_side else [[subject] for subject in subjects]
     progress = Progress()
     for group in groups:
-        made = film(group, view, r_g_b, chosen.side_by_side, chosen.captions)
+        made = film(group, view, r_g_b, chosen.side_by_side, chosen.captions, chosen.sharp)
         if len(made) > MOST_FRAMES:
             raise BadInput(f"{len(made)} frames: expected at most {MOST_FRAMES}; choose a lower --fps")
         _write(made, chosen, _target(chosen, group[0].run.folder), progress)

@@ -132,7 +132,12 @@ class Dataset(Protocol):
 
 
 class Avatar(Protocol):
-    """A fitted person that can be drawn in any pose from any camera."""
+    """A fitted person that can be drawn in any pose from any camera.
+
+    More is asked of none, but `ihbench export` and `render` use what there is: `betas` [B] and `body`, its shape and
+    the body that it moves with; `posed_gaussians(body_pose)`, a `fit.gaussians.posed.PosedGaussians`; and, where
+    Gaussian k lies at texel k of the body's UV map, that map's table `texels` (`body.uv.Texels`).
+    """
 
     def render(
         self,

@@ -228,6 +228,6 @@ def placed(motion: Motion, body: Body, betas: Array, there: Stand) -> Motion:
     turn = there.axes @ here.axes.T
     rest = body.shaped(betas)[1][0]
     pose = motion.pose.copy()
-    pose[:, 0] = (Rotation.from_matrix(turn) * Rotation.from_rotvec(motion.pose[:, 0])).as_rotvec()
+    pose[:, 0] = (Rotation.from_matrix(turn) * Rotation.from_rotvec(pose[:, 0])).as_rotvec()
     transl = (motion.transl + rest - here.pelvis) @ turn.T + there.pelvis - rest
     return replace(motion, pose=pose, transl=transl)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.metrics.eight_bit import displayed
+from ihbench.show.detail import drawn
 from ihbench.show.panels import beside
 from ihbench.show.shots import Shot, Take, View, take_of
 from ihbench.show.subject import Subject, names_of
@@ -25,6 +26,7 @@ class Film:
     background: tuple[float, float, float]  # RGB in [0, 1]
     truth: bool  # a panel before the others
     names: Sequence[str]  # over the panels; none for no captions
+    sharp: bool = False  # finer than the training images, too: see `show.detail`
 
     def __len__(self) -> int:
         return len(self.takes[0].shots)
@@ -37,11 +39,21 @@ class Film:
         """[H, W, 3] each, drawn when asked for."""
         with progress.task("rendering", len(self)) as task:
             for shots in zip(*(take.shots for take in self.takes), strict=True):
-                panels = [_drawn(s, shot, self.background) for s, shot in zip(self.subjects, shots, strict=True)]
+                panels = [self._panel(*of_run) for of_run in zip(self.subjects, self.takes, shots, strict=True)]
                 if self.truth and shots[0].truth is not None:
                     panels.insert(0, displayed(shots[0].truth()))
                 yield beside(panels, self.names, self.background)
                 task.advance()
+
+    def _panel(self, subject: Subject, take: Take, shot: Shot) -> NDArray[np.uint8]:
+        camera = shot.camera.undistorted() if shot.camera.distortion is not None else shot.camera
+        pixel = None if self.sharp or take.as_scored else subject.pixel
+        image = drawn(subject.avatar, camera, shot.body_pose, self.background, shot.frame, subject.body, pixel)[0]
+        expected = (camera.height, camera.width, 3)
+        if np.shape(image) != expected:
+            method = subject.run.record.identity.method
+            raise BadInput(f"{method}: rendered an image of shape {np.shape(image)}, expected {expected}")
+        return displayed(np.asarray(image))
 
 
 def film(
@@ -50,6 +62,7 @@ def film(
     background: tuple[float, float, float] | None = None,  # None: the protocol's
     side_by_side: bool = False,
     captions: bool = True,
+    sharp: bool = False,
 ) -> Film:
     """What to draw. Raises `BadInput`, also for runs whose frames do not go together."""
     takes = [take_of(subject, view) for subject in subjects]
@@ -64,14 +77,4 @@ def film(
     names = (["truth"] if truth else []) + names_of([subject.run for subject in subjects])
     own = subjects[0].run.protocol.image.background if background is None else background
     r, g, b = own
-    return Film(subjects, takes, (r, g, b), truth, names if captions and side_by_side else ())
-
-
-def _drawn(subject: Subject, shot: Shot, background: tuple[float, float, float]) -> NDArray[np.uint8]:
-    camera = shot.camera.undistorted() if shot.camera.distortion is not None else shot.camera
-    image = subject.avatar.render(camera, shot.body_pose, background, shot.frame)[0]
-    expected = (camera.height, camera.width, 3)
-    if np.shape(image) != expected:
-        method = subject.run.record.identity.method
-        raise BadInput(f"{method}: rendered an image of shape {np.shape(image)}, expected {expected}")
-    return displayed(np.asarray(image))
+    return Film(subjects, takes, (r, g, b), truth, names if captions and side_by_side else (), sharp)

@@ -50,6 +50,7 @@ class View:
 class Take:
     shots: list[Shot]
     fps: float
+    as_scored: bool = False  # by a camera of the data set in the protocol's size
 
 
 def take_of(subject: Subject, view: View) -> Take:
@@ -111,12 +112,12 @@ def _from_data_camera(subject: Subject, view: View, name: str) -> Take:
         first = capture.body_pose(min(tests or subject.training_frames))
         stand = stand_of(subject.body, first, up_axis([first]))
         motion = placed(subject.motion(view.motion, fps), subject.body, subject.betas, stand)
-        return Take([Shot(camera, pose) for pose in motion.body_poses(subject.betas)], fps)
+        return Take([Shot(camera, pose) for pose in motion.body_poses(subject.betas)], fps, not view.size)
     if view.pose is not None and not view.pose.isdecimal():
         first = capture.body_pose(min(tests or subject.training_frames))
         pose = subject.pose(view.pose)
         stand = stand_of(subject.body, first, up_axis([first]))
-        return Take([Shot(camera, _moved(subject, pose, stand))], fps)
+        return Take([Shot(camera, _moved(subject, pose, stand))], fps, not view.size)
     frames = [int(view.pose)] if view.pose is not None else sorted(tests) or subject.training_frames
     trained = set(subject.training_frames)
     shots = []
@@ -124,7 +125,7 @@ def _from_data_camera(subject: Subject, view: View, name: str) -> Take:
         pose = subject.pose(str(frame))
         truth = _truth(subject, tests[frame], camera) if frame in tests else None
         shots.append(Shot(camera, pose, frame if frame in trained else None, truth))
-    return Take(shots, fps)
+    return Take(shots, fps, not view.size)
 
 
 def _truth(subject: Subject, index: int, camera: Camera) -> Callable[[], NDArray[np.float32]]:

@@ -16,6 +16,7 @@ from ihbench.config_fields import WHOLE, whole
 from ihbench.errors import BadInput
 from ihbench.record.finished_run import FinishedRun
 from ihbench.runner.run_loop import load_avatar
+from ihbench.show.detail import training_pixel
 from ihbench.show.motion import Motion, find_motion
 
 if TYPE_CHECKING:
@@ -47,6 +48,14 @@ class Subject:
         if own is not None:
             return np.asarray(own.detach().cpu() if hasattr(own, "detach") else own, np.float64).reshape(-1)
         return self.run.capture.body_pose(self.training_frames[0]).betas
+
+    @cached_property
+    def pixel(self) -> float | None:
+        """m at the body of a pixel of the training images; None where the data are not at hand."""
+        try:
+            return training_pixel(self.run, self.body)
+        except BadInput:
+            return None
 
     @property
     def training_frames(self) -> list[int]:

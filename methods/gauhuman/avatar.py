@@ -15,6 +15,7 @@ from ihbench.camera import Camera
 from ihbench.config_fields import read
 from ihbench.fit.avatar_files import read_avatar, write_avatar
 from ihbench.fit.gaussians.gaussian_set import SHAPES, Gaussians
+from ihbench.fit.gaussians.posed import PosedGaussians
 from ihbench.fit.gaussians.skinned_covariance import skinned_covariance
 from ihbench.methods.gauhuman.config import GauHumanConfig
 from ihbench.methods.gauhuman.deformation import Deformation, Frame, Posed
@@ -80,6 +81,14 @@ class GauHumanAvatar(nn.Module):
         """Let each Gaussian carry the vertex that is nearest to it now."""
         self.gaussians.carried(VERTEX).copy_(self.deformation.nearest(self.gaussians.means))
 
+    @torch.no_grad()
+    def posed_gaussians(self, body_pose: BodyPose) -> PosedGaussians:
+        """As they are drawn; see `scene.contracts.Avatar`."""
+        vertex = self.deformation.nearest(self.gaussians.means)
+        posed = self.posed(self.deformation.frame(body_pose), vertex)
+        opacities = self.gaussians.opacities
+        return PosedGaussians(posed.means, self.covariances(posed), self.sh, None, opacities, self.degree)
+
     def render(
         self,
         camera: Camera,
@@ -90,16 +99,15 @@ class GauHumanAvatar(nn.Module):
         """rgb [H, W, 3] on `background` and alpha [H, W]; see `scene.contracts.Avatar`. As released, the pose network
         corrects any pose, also those that nobody trained on."""
         with torch.no_grad():
-            vertex = self.deformation.nearest(self.gaussians.means)
-            posed = self.posed(self.deformation.frame(body_pose), vertex)
+            own = self.posed_gaussians(body_pose)
             rgb, alpha = render_gaussians(
-                posed.means,
-                self.covariances(posed),
-                self.sh,
+                own.means,
+                own.scales,
+                own.colors,
                 camera,
                 background,
-                opacities=self.gaussians.opacities,
-                sh_degree=self.degree,
+                opacities=own.opacities,
+                sh_degree=own.sh_degree,
                 preset="3dgs",
             )
         return rgb.clamp(0, 1).cpu().numpy(), alpha.clamp(0, 1).cpu().numpy()

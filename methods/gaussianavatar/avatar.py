@@ -19,6 +19,7 @@ from ihbench.camera import Camera
 from ihbench.config_fields import read
 from ihbench.fit.avatar_files import read_avatar, write_avatar
 from ihbench.fit.decoded_cache import DecodedCache
+from ihbench.fit.gaussians.posed import PosedGaussians
 from ihbench.methods.gaussianavatar.config import GaussianAvatarConfig
 from ihbench.methods.gaussianavatar.pose_encoder import PoseEncoder
 from ihbench.methods.gaussianavatar.texel_network import TexelDecoder, TexelOutputs, measure_statistics, smoothing
@@ -47,7 +48,7 @@ class TexelAvatar(nn.Module):
         self.config, self.body, self.betas = config, body, np.asarray(betas, np.float64)
         self.scale_share = 1.0  # of the decoded scale, what is drawn
         self._cache: DecodedCache[TexelOutputs] = DecodedCache()
-        texels = texel_table(body, config.texels)
+        texels = self.texels = texel_table(body, config.texels)
         canonical = BodyPose(canonical_pose("gaussianavatar"), self.betas, np.array(CANONICAL_TRANSL))
         self._from_canonical = np.linalg.inv(body.joint_transforms(canonical))
         weights = texels.interpolate(body.weights, body.faces)
@@ -146,6 +147,10 @@ class TexelAvatar(nn.Module):
 
         outputs = self._cache.get(self, key, decode)
         return self.posed(outputs.offset, self.transforms(body_pose)), outputs.scale, outputs.color
+
+    def posed_gaussians(self, body_pose: BodyPose) -> PosedGaussians:
+        """The same as files have them; see `scene.contracts.Avatar`."""
+        return PosedGaussians(*self.gaussians(body_pose))
 
     def render(
         self,

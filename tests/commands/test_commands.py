@@ -177,61 +177,6 @@ def test_a_damaged_run_does_not_take_the_others_with_it(bench_with_run, finished
     assert all(any(f"/{name}" in line for line in lines) for name in ("cut", "foreign", "lost"))
 
 
-# ------------------------------------------------------------------------------------------------------ export
-
-
-@pytest.mark.parametrize("pose", ["a_pose", "120"])
-def test_export_writes_the_avatars_gaussians_in_the_pose_asked_for(bench_with_run, tmp_path, pose):
-    (folder,) = bench_with_run.folders()
-    out = tmp_path / "avatar.ply"
-    outcome = bench_with_run("export", folder, "--to", "ply", "--pose", pose, "--axes", "world", "--out", out)
-    assert outcome.status == 0, outcome.err
-    means, scales, colors = read_splat_ply(out.read_bytes())
-    with bench_with_run.in_its_world():
-        run = FinishedRun(folder)
-        avatar = load_avatar(run)
-        named = BodyPose(canonical_pose("a_pose"), avatar.betas, np.zeros(3))
-        body_pose = run.capture.body_pose(120) if pose == "120" else named
-        expected = [value.numpy() for value in avatar.gaussians(body_pose)]
-    assert len(means) == len(avatar) > 100
-    np.testing.assert_array_equal(means, expected[0])
-    np.testing.assert_allclose(scales, expected[1], rtol=1e-5)
-    np.testing.assert_allclose(colors, expected[2], atol=1e-6)
-    body = avatar.body.pose(body_pose)
-    np.testing.assert_allclose([means.min(0), means.max(0)], [body.min(0), body.max(0)], atol=0.05)
-
-    bench_with_run("export", folder, "--pose", pose, "--out", out)
-    seen = read_splat_ply(out.read_bytes())[0]
-    pelvis, root = avatar.body.posed_joints(body_pose)[0], axis_angle_to_matrix(body_pose.pose[0])
-    np.testing.assert_allclose(seen * (-1, -1, 1) @ root.T + pelvis, means, atol=1e-5)
-    assert seen[:, 1].min() < -0.3  # the head is up where y points down, the feet are down
-    assert seen[:, 1].max() > 0.6
-    head = out.read_bytes().partition(b"end_header")[0].decode("ascii").splitlines()
-    assert [line for line in head if line.startswith("comment")][2:] == [
-        f"comment pose: {pose}",
-        "comment units: metres",
-        "comment axes: y down, z forward (180 degrees about z from y-up); the pelvis at the origin",
-        "comment SplatRenderMode: default",
-    ]
-
-
-def test_export_lies_in_the_run_folder_unless_told_otherwise(bench_with_run):
-    (folder,) = bench_with_run.folders()
-    outcome = bench_with_run("export", folder)
-    assert str(folder / "avatar.ply") in outcome.out
-    assert len(read_splat_ply((folder / "avatar.ply").read_bytes())[0]) > 100
-
-
-def test_export_in_a_frames_pose_never_takes_another_person(bench_with_run, tmp_path):
-    """standin-1 of another cast has the same name and another body."""
-    (folder,) = bench_with_run.folders()
-    with bench_with_run.in_its_world():
-        registry.load("stand-in", "zju_mocap").ensure(tmp_path / "cast", 1, ["standin-1"], {0: [0]})
-    outcome = bench_with_run("export", folder, "--pose", "0", "--data", tmp_path / "cast")
-    assert outcome.status == 2
-    assert "holds stand-in v2 seed 1, the run was made on stand-in v2 seed 0" in outcome.err
-
-
 # -------------------------------------------------------------------------------------------------------- data
 
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ihbench.errors import BadInput
-from ihbench.files.splat_ply import VIEWER_TURN, in_viewer_axes, read_splat_ply, splat_ply, write_splat_ply
+from ihbench.files.splat_ply import read_splat_ply, splat_ply, write_splat_ply
 
 # the order and names in which the released 3D Gaussian splatting code writes them, without the higher harmonics
 FIELDS = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
@@ -70,16 +70,29 @@ def test_comments_stand_in_the_header_in_one_line_each():
     assert np.array_equal(read_splat_ply(splat_ply(*some(3), ["element vertex 9"]))[0], some(3)[0])
 
 
-def test_viewer_axes_turn_an_upright_body_by_half_a_turn_about_z():
-    root = Rotation.from_rotvec([0.3, -2.0, 1.0]).as_matrix()
-    own = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1], [0.2, -0.9, 0.1]])  # head up, left hand, nose, a foot
-    pelvis = np.array([5.0, -3, 100])
-    turned = in_viewer_axes(own @ root.T + pelvis, pelvis, root)
-    np.testing.assert_allclose(turned, [[0, -1, 0], [-1, 0, 0], [0, 0, 1], [-0.2, 0.9, 0.1]], atol=1e-5)
-    w, x, y, z = VIEWER_TURN
-    np.testing.assert_allclose(Rotation.from_quat([x, y, z, w]).apply(own), turned, atol=1e-5)
-    _, table = parse(splat_ply(*some(2), rotation=VIEWER_TURN))
-    assert [float(table[f"rot_{k}"][0]) for k in range(4)] == list(VIEWER_TURN)
+def test_turned_and_transparent_needles_with_harmonics():
+    rng = np.random.default_rng(1)
+    n = 20
+    means, _, colors = some(n)
+    scales, opacities = rng.uniform(1e-3, 1e-1, (n, 3)), rng.uniform(0, 1, n)
+    opacities[:2] = 0, 1  # neither has a finite logit
+    turns = Rotation.random(n, random_state=0).as_quat()[:, [3, 0, 1, 2]]
+    harmonics = rng.normal(size=(n, 9, 3))
+    _, table = parse(splat_ply(means, scales, colors, (), turns, opacities, harmonics))
+    rest = [f"f_rest_{k}" for k in range(24)]
+    assert list(table.dtype.names) == [*FIELDS[:9], *rest, *FIELDS[9:]]
+    for k in range(3):
+        np.testing.assert_allclose(np.exp(table[f"scale_{k}"]), scales[:, k], rtol=2e-6)
+        np.testing.assert_allclose(table[f"f_dc_{k}"], harmonics[:, 0, k], rtol=1e-6)
+        for m in range(8):  # channel by channel
+            np.testing.assert_allclose(table[f"f_rest_{8 * k + m}"], harmonics[:, 1 + m, k], rtol=1e-6)
+    for k in range(4):
+        np.testing.assert_allclose(table[f"rot_{k}"], turns[:, k], atol=1e-6)
+    np.testing.assert_allclose(1 / (1 + np.exp(-table["opacity"].astype(float))), opacities, atol=1.1e-3)
+    with pytest.raises(ValueError, match="harmonics"):
+        splat_ply(means, scales, colors, (), turns, opacities, harmonics[:, :5])
+    with pytest.raises(ValueError, match="opacities"):
+        splat_ply(means, scales, colors, (), turns, opacities + 0.5)
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from ihbench.camera import Camera
 from ihbench.config_fields import read
 from ihbench.fit.avatar_files import read_avatar, write_avatar
 from ihbench.fit.decoded_cache import DecodedCache
+from ihbench.fit.gaussians.posed import PosedGaussians
 from ihbench.fit.precision import autocast
 from ihbench.methods.inpainthuman.avatar.decoder import GaussianDecoder, scale_factor
 from ihbench.methods.inpainthuman.avatar.pose_residual import ResidualEncoder, root_free_position_map
@@ -215,6 +216,10 @@ class GaussianAvatar(nn.Module):
             return self.decode(self.every_point, self.position_map(body_pose) if self.residual_on else None)
 
         return self._decoded_cache.get(self, key, decode)
+
+    def posed_gaussians(self, body_pose: BodyPose) -> PosedGaussians:
+        """The same as files have them; see `scene.contracts.Avatar`."""
+        return PosedGaussians(*self.gaussians(body_pose))
 
     def render(
         self,

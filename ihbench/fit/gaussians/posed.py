@@ -1,0 +1,19 @@
+"""An avatar's Gaussians in one pose, as they are drawn: what `ihbench export` writes into files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class PosedGaussians:
+    """The arguments of `render.splat.render_gaussians` but for camera and background; world, metres."""
+
+    means: Tensor  # [N, 3] m
+    scales: Tensor  # [N] or [N, 3] m, standard deviations, or [N, 3, 3] m², covariances
+    colors: Tensor  # [N, 3], or spherical harmonics [N, K, 3]
+    quaternions: Tensor | None = None  # [N, 4] w x y z, of scales [N, 3]
+    opacities: Tensor | None = None  # [N] 0..1; None: opaque
+    sh_degree: int | None = None  # None: `colors` are colours
