@@ -20,7 +20,7 @@ from ihbench.files import atomic
 from ihbench.record import outputs
 
 if TYPE_CHECKING:
-    from ihbench.record.results import RunResult
+    from ihbench.record.results import NotRun, RunResult
 
 SHOWN = 20  # folders left out that are named on stderr
 
@@ -134,9 +134,9 @@ def _on_terminal() -> bool:
     return sys.stdout.isatty()
 
 
-def headline(results: Sequence[RunResult], left_out: Sequence[str] = ()) -> str:
+def headline(results: Sequence[RunResult], left_out: Sequence[str] = (), not_run: Sequence[NotRun] = ()) -> str:
     """The headline table of some runs, as wide as the terminal, 80 columns at most."""
-    return registry.load("table", "headline")(results, left_out, shutil.get_terminal_size().columns)
+    return registry.load("table", "headline")(results, left_out, shutil.get_terminal_size().columns, not_run)
 
 
 def say_left_out(lines: Sequence[str]) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field, make_dataclass
+from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -13,14 +15,16 @@ from ihbench import registry
 from ihbench.commands.options.device import check_device
 from ihbench.commands.options.keep import check_keep
 from ihbench.commands.options.parse import options
-from ihbench.commands.options.scene_choice import RunsFolder, SceneChoice
+from ihbench.commands.options.scene_choice import DEFAULT_METHOD, RunsFolder, ScenesChoice
 from ihbench.commands.report import headline
 from ihbench.config_fields import SEEDS, refuse_repeated
 from ihbench.errors import BadInput
 from ihbench.scene.method_spec import method_spec
 
 if TYPE_CHECKING:
-    from ihbench.record.results import RunResult
+    from ihbench.record.results import NotRun, RunResult
+
+EVERY_METHOD = "all"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +38,12 @@ class Fitting:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunOptions(SceneChoice, Fitting):
+class RunOptions(ScenesChoice, Fitting):
+    method: tuple[str, ...] = (DEFAULT_METHOD,)
+    """A registered method (`ihbench list methods`), or several, or "all": every registered one, a variant that is
+    registered under a name of its own (occgauhuman) included. Several are run one after another, each with its own
+    profile; --method.* switches are those of one method, so they go with one alone. A method that cannot run on a
+    scene has its reason in the table, and the others go on."""
     seed: Annotated[tuple[int, ...], SEEDS] = (0,)
     """Seeds; each is a run of its own."""
     keep: tuple[str, ...] = ()
@@ -51,21 +60,30 @@ class LikeOptions(RunsFolder, Fitting):
 
 
 def main(argv: list[str]) -> int:
-    if _peek(argv, "--like", ""):
+    if _peek(argv, "--like"):
         return _repeat(options(LikeOptions, argv, "run", "Repeat a run from its record."))
-    method, profile = _peek(argv, "--method", "inpainthuman"), _peek(argv, "--profile", "quick")
-    chosen = options(_with_switches(method, profile), argv, "run", "Fit a method under a protocol and score it.")
-    return _run(chosen)
+    about = "Fit a method, or several, under a protocol and score it."
+    methods, profile = _peek(argv, "--method") or [DEFAULT_METHOD], _peek(argv, "--profile") or ["quick"]
+    if len(methods) == 1 and methods != [EVERY_METHOD]:
+        return _run(options(_with_switches(methods[0], profile[0]), argv, "run", about))
+    for word in argv:
+        if word.startswith("--method."):
+            flag = word.partition("=")[0]
+            raise BadInput(
+                f"{flag}: a switch of one method, and --method names {' '.join(methods)}; "
+                f"run the method that it is of alone: --method NAME {flag} ..."
+            )
+    return _run_several(options(RunOptions, argv, "run", about))
 
 
-def _peek(argv: list[str], flag: str, default: str) -> str:
-    """The value of a flag that decides which other flags exist."""
+def _peek(argv: list[str], flag: str) -> list[str]:
+    """The values of a flag that decides which other flags exist; none where it is not there."""
     for k, word in enumerate(argv):
-        if word == flag and k + 1 < len(argv):
-            return argv[k + 1]
+        if word == flag:
+            return list(takewhile(lambda value: not value.startswith("--"), argv[k + 1 :]))
         if word.startswith(flag + "="):
-            return word.partition("=")[2]
-    return default
+            return [word.partition("=")[2]]
+    return []
 
 
 def _with_switches(method: str, profile: str) -> type[RunOptions]:
@@ -78,8 +96,9 @@ def _with_switches(method: str, profile: str) -> type[RunOptions]:
 
 
 def _run(chosen: Any) -> int:
-    check_device(chosen.device)
-    registry.entry_point("report", "md")  # before anything is fitted: another package may claim the name
+    """One method, with switches."""
+    _check(chosen)
+    check_keep(chosen.keep, chosen.config)
     from dataclasses import replace
 
     from ihbench.clock.progress import Progress
@@ -87,24 +106,69 @@ def _run(chosen: Any) -> int:
     from ihbench.scene.data_source import locate
     from ihbench.scene.protocol import load_protocol
 
-    protocols = chosen.apply(load_protocol(chosen.protocol, chosen.profile))
-    check_keep(chosen.keep, chosen.config)
+    (method,) = chosen.method
+    progress = Progress()
+    results = []
+    for protocol in chosen.apply(load_protocol(chosen.protocol, chosen.profile)):
+        source = locate(protocol, chosen.data, chosen.scene)
+        request = RunRequest(
+            protocol, method, chosen.config, 0, chosen.device, chosen.runs, chosen.body, chosen.force, chosen.keep
+        )
+        for scene in source.scenes:
+            for seed in chosen.seed:
+                progress.say(f"{protocol.name} {scene}: {method}, {chosen.profile} profile, seed {seed}")
+                results.append(run_scene(replace(request, seed=seed), source, scene, progress))
+    return _print(results, chosen)
+
+
+def _run_several(chosen: RunOptions) -> int:
+    """Several methods, each with its profile as it is; scenes outermost, so that an early table compares them."""
+    _check(chosen)
+    methods = _named_methods(chosen.method)
+    if any(name != "all" for name in chosen.keep):
+        raise BadInput(f"--keep {' '.join(chosen.keep)}: switches of one method; with several only --keep all")
+    from ihbench.clock.progress import Progress
+    from ihbench.runner.several_methods import SeveralMethods, run_methods
+    from ihbench.scene.data_source import locate
+    from ihbench.scene.protocol import load_protocol
+
+    progress = Progress()
+    results: list[RunResult] = []
+    not_run: list[NotRun] = []
+    for protocol in chosen.apply(load_protocol(chosen.protocol, chosen.profile)):
+        source = locate(protocol, chosen.data, chosen.scene)
+        asked = SeveralMethods(
+            protocol, methods, chosen.seed, chosen.device, chosen.runs, chosen.body, chosen.force, chosen.keep
+        )
+        finished, missing = run_methods(asked, source, progress)
+        results += finished
+        not_run += missing
+    reasons = {missing.reason for missing in not_run}
+    if not results and len(reasons) == 1:  # it is not the methods
+        raise BadInput(reasons.pop())
+    return _print(results, chosen, not_run)
+
+
+def _check(chosen: RunOptions) -> None:
+    """What must be right before anything is fitted."""
+    check_device(chosen.device)
+    registry.entry_point("report", "md")  # another package may claim the name
     if not chosen.seed:
         raise BadInput("--seed: expected one number or more")
     refuse_repeated(chosen.seed, "--seed")
-    progress = Progress()
-    results = []
-    for protocol in protocols:
-        source = locate(protocol, chosen.data, chosen.scene)
-        request = RunRequest(
-            protocol, chosen.method, chosen.config, 0, chosen.device, chosen.runs, chosen.body, chosen.force,
-            chosen.keep,
-        )  # fmt: skip
-        for scene in source.scenes:
-            for seed in chosen.seed:
-                progress.say(f"{protocol.name} {scene}: {chosen.method}, {chosen.profile} profile, seed {seed}")
-                results.append(run_scene(replace(request, seed=seed), source, scene, progress))
-    return _print(results, chosen)
+
+
+def _named_methods(names: Sequence[str]) -> tuple[str, ...]:
+    """Registered methods by their names. Raises `BadInput` for an unknown or repeated one."""
+    registered = registry.names("method")
+    if EVERY_METHOD in names:
+        if len(names) > 1:
+            raise BadInput(f"--method {' '.join(names)}: {EVERY_METHOD} is every method; name it alone")
+        return tuple(registered)
+    refuse_repeated(names, "--method")
+    for name in names:
+        registry.entry_point("method", name)
+    return tuple(names)
 
 
 def _repeat(chosen: LikeOptions) -> int:
@@ -125,16 +189,18 @@ def _repeat(chosen: LikeOptions) -> int:
     return _print([result], chosen)
 
 
-def _print(results: list[RunResult], chosen: Any) -> int:
+def _print(results: list[RunResult], chosen: Any, not_run: Sequence[NotRun] = ()) -> int:
     from ihbench.record.results import summary
 
     if chosen.json:
-        print(json.dumps(summary(results), allow_nan=False))
+        print(json.dumps(summary(results, not_run), allow_nan=False))
     elif not chosen.full:
-        print(headline(results), end="")
+        print(headline(results, not_run=not_run), end="")
     else:
         print(registry.load("report", "md")(results))
+        for missing in not_run:
+            print(f"{missing.method} on {missing.scene}: not run: {missing.reason}")
         for result in results:
             done = result.status == "done"
             print(f"{result.scene}: {result.folder / 'contact_sheet.png' if done else result.outcome}")
-    return 0 if all(result.status == "done" for result in results) else 1
+    return 0 if not not_run and all(result.status == "done" for result in results) else 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -126,6 +126,18 @@ class RunResult:
         if self.about.standin:
             return f"{self.about.standin}: made by the bench, not real data"
         return f"real data ({self.about.variant})"
+
+
+@dataclass(frozen=True)
+class NotRun:
+    """A run that was asked for together with others and came to nothing that could be recorded, and why."""
+
+    protocol: str  # as in a run's identity
+    profile: str
+    method: str
+    scene: str
+    seed: int
+    reason: str
 
 
 def grouped(pairs: Iterable[tuple[Key, Value]]) -> dict[Key, list[Value]]:
@@ -272,11 +284,12 @@ def _is_row_of(method: str, row: str) -> bool:
     return row == method or (row.startswith(f"{method} [") and row.endswith("]"))
 
 
-def summary(results: Iterable[RunResult]) -> dict[str, object]:
+def summary(results: Iterable[RunResult], not_run: Sequence[NotRun] = ()) -> dict[str, object]:
     """What `--json` prints of runs: strict JSON, numbers that are not finite as strings."""
     results = list(results)
     return {
-        "status": "done" if all(r.status == "done" for r in results) else "not done",
+        "status": "done" if not not_run and all(r.status == "done" for r in results) else "not done",
+        **({"not_run": [asdict(missing) for missing in not_run]} if not_run else {}),
         "runs": [
             {
                 "folder": str(r.folder),

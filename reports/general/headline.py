@@ -9,7 +9,7 @@ from rich.cells import cell_len, set_cell_size
 
 from ihbench.errors import visible
 from ihbench.metrics import Identity
-from ihbench.record.results import TRACEBACK, RunResult, by_group
+from ihbench.record.results import TRACEBACK, NotRun, RunResult, by_group
 from ihbench.record.row_labels import by_label
 from ihbench.reports.general.clock import one_clock
 from ihbench.reports.general.significance import further_rows, score_cells
@@ -22,19 +22,31 @@ GAP = 2
 SHOWN = 6  # pictures, and runs that are not done, that are named one by one
 
 
-def write(results: Sequence[RunResult], left_out: Sequence[str] = (), width: int = WIDTH) -> str:
+def write(
+    results: Sequence[RunResult],
+    left_out: Sequence[str] = (),
+    width: int = WIDTH,
+    not_run: Sequence[NotRun] = (),
+) -> str:
     """Lines of at most `width` columns, but for paths, which are whole: of every protocol, profile and kind of data
-    the headline region's metrics by row, methods before calibration rows; runs that are not done; contact sheets."""
+    the headline region's metrics by row, methods before calibration rows; runs that are not done; contact sheets.
+    A method of which no run is done has a row without numbers."""
     width = max(NARROWEST, min(width, WIDTH))
     lines: list[str] = []
     for runs in by_group(results).values():
-        lines += [*_group(runs, width), ""]
+        protocol, _, profile, _ = runs[0].group
+        missing = [run.method for run in not_run if (run.protocol, run.profile) == (protocol, profile)]
+        lines += [*_group(runs, width, missing), ""]
     unfinished = [run for run in results if run.status != "done"]
     for run in unfinished[:SHOWN]:
         reason = f" ({run.reason})" if run.reason else ""
         lines += _wrapped(f"not done: {run.method} on {run.scene}: {run.status}{reason}", width)
         traceback = run.folder / TRACEBACK
         lines.append(f"see {visible(str(traceback if traceback.is_file() else run.folder))}")
+    for run in not_run[:SHOWN]:
+        lines += _wrapped(f"not run: {run.method} on {run.scene}: {run.reason}", width)
+    if len(not_run) > SHOWN:
+        lines.append(f"not run: {len(not_run) - SHOWN} more")
     if len(unfinished) > SHOWN:
         lines.append(f"not done: {len(unfinished) - SHOWN} more runs")
     sheets = [run.folder / "contact_sheet.png" for run in results if run.status == "done"]
@@ -49,7 +61,7 @@ def write(results: Sequence[RunResult], left_out: Sequence[str] = (), width: int
     return "\n".join(lines) + "\n"
 
 
-def _group(runs: Sequence[RunResult], width: int) -> list[str]:
+def _group(runs: Sequence[RunResult], width: int, not_run: Sequence[str]) -> list[str]:
     protocol, _, profile, data = runs[0].group
     title = _wrapped(f"{protocol}, {profile} profile, {data}", width)
     done = [run for run in runs if run.status == "done"]
@@ -61,6 +73,10 @@ def _group(runs: Sequence[RunResult], width: int) -> list[str]:
     own = [run.own for run in done]
     present = [i for i in in_headline if any(i in means and not means[i].absent for means in own)]
     rows = _rows(done, present)
+    without = dict.fromkeys([*(run.method for run in runs), *not_run])
+    without = [method for method in without if not any(run.method == method for run in done)]
+    bounds = next((k for k, (name, _) in enumerate(rows) if name in ROWS), len(rows))
+    rows[bounds:bounds] = [(method, ["—"] * (len(present) + 1)) for method in without]
     heads = [i.display.head() for i in present] + ["fit s"]
     table = [(visible(name), cells) for name, cells in [(f"region {headline}", heads), *rows]]
     sizes = [max(cell_len(cells[k]) for _, cells in table) for k in range(len(heads))]

@@ -66,6 +66,7 @@ if TYPE_CHECKING:
 else:
     Choices = Annotated[_optional(ProtocolFile), tyro.conf.arg(name="protocol")]
 NO_CHOICE = get_args(Choices)[0]()
+DEFAULT_METHOD = "inpainthuman"
 
 
 @dataclass(frozen=True)
@@ -146,12 +147,16 @@ class RunsFolder(OwnFiles):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneChoice(ProtocolChanges, RunsFolder):
+class ScenesChoice(ProtocolChanges, RunsFolder):
     protocol: str
     """A registered protocol (`ihbench list protocols`), or the path of a protocol file of your own (.toml)."""
-    method: str = "inpainthuman"
-    """A registered method (`ihbench list methods`)."""
     scene: tuple[str, ...] = ()
     """Scenes; none means all that the protocol names."""
     profile: str = "quick"
     """quick (256 px, for a CPU) or paper (512 px, the paper's settings)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneChoice(ScenesChoice):
+    method: str = DEFAULT_METHOD
+    """A registered method (`ihbench list methods`)."""
