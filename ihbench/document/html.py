@@ -30,7 +30,7 @@ code { background: #f3f3f3; padding: 0 .2em; }
 img { max-width: 100%; height: auto; }
 figure { margin: 1.5rem 0; } figcaption { color: #444; }
 section { margin: 2rem 0; padding: .2rem 1rem; border-left: 5px solid #888; }
-section.quoted { border-color: #777; } section.real-data { border-color: #1b7837; }
+section.quoted, section.quoted-elsewhere { border-color: #777; } section.real-data { border-color: #1b7837; }
 section.stand-in { border-color: #b35806; background: #fff7ec; }
 th.group { text-align: center; } tr.section td { border-top: 1px solid #bbb; }
 tr.bound { color: #666; } td.absent { color: #888; } td.unreliable { color: #a00; }

@@ -20,7 +20,7 @@ the bootstrap. It does not mend skewness; what it has over t is that it stays wi
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -115,8 +115,10 @@ def cluster_bootstrap(
     level: float = 0.95,
     seed: int = 0,
     replicates: int = REPLICATES,
+    statistic: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None,
 ) -> NDArray[np.float64]:
-    """[2, ...]: low and high ends of the interval from resampling whole subjects, one pair per data set.
+    """[2, ...]: low and high ends of the interval from resampling whole subjects, one pair per data set. With a
+    `statistic` [..., replicates] -> [replicates] of the data sets' replicated means, the pair [2] of that instead.
 
     A bootstrap of few subjects is too narrow by sqrt((n-1)/n) and knows no t tails; its percentiles are taken further
     out by just that (Hesterberg, "What teachers should know about the bootstrap", 2015, expanded percentiles). Plain
@@ -132,7 +134,8 @@ def cluster_bootstrap(
     tail = stats.norm.cdf(-math.sqrt(n / (n - 1)) * quantile)
     # frames are not resampled within subjects: their scatter is in that of the subjects' means and would count twice
     counts = np.random.default_rng(seed).multinomial(n, np.full(n, 1 / n), size=replicates)  # [replicates, n]
-    return np.quantile(means @ (counts / n).T, [tail, 1 - tail], axis=-1)
+    replicated = means @ (counts / n).T
+    return np.quantile(replicated if statistic is None else statistic(replicated), [tail, 1 - tail], axis=-1)
 
 
 def paired_test(

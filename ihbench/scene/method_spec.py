@@ -57,6 +57,7 @@ class MethodSpec:
     paper: Paper | None = None
     licence: str = ""
     implemented: str = ""  # how much of the paper, and what differs
+    footnote: str = ""  # what every table must say of this method's rows, such as that details are inferred
     needs: tuple[str, ...] = ("images", "three-state masks", "cameras", "SMPL poses")
     leave_out: LeaveOut | None = None  # what a scene does not need of a configuration: see `scene.plan`
     outside_files: OutsideFiles | None = None  # files that a configuration names and whose content moves numbers
@@ -114,7 +115,7 @@ class MethodSpec:
 
 
 KINDS = {  # field of a spec -> what it must be: a package that got it wrong must not take `ihbench --help` along
-    **dict.fromkeys(("title", "summary", "licence", "implemented"), str),
+    **dict.fromkeys(("title", "summary", "licence", "implemented", "footnote"), str),
     "profiles": (str, Mapping), "paper": (Paper, type(None)), "needs": (tuple, list),
     "shared_states": Mapping, "ablations": (str, Mapping), "stress": (str, list, tuple),
     "kernels": Mapping, "commands": Mapping,

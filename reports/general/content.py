@@ -31,6 +31,7 @@ from ihbench.reports.general.inpainting import inpainting_section
 from ihbench.reports.general.ledger_table import ledger_section
 from ihbench.reports.general.run_time import across_sizes_section, run_time_section
 from ihbench.reports.general.significance import further_rows, intervals_section, score_cells
+from ihbench.reports.general.strip_cost import strip_cost_section
 from ihbench.scoring.calibration import DESCRIPTIONS, ROWS
 
 
@@ -51,6 +52,7 @@ def general_report(
     for runs in by_group(results).values():
         blocks += _group(runs, presets, targets)
     blocks += across_sizes_section(results)
+    blocks += strip_cost_section(results)
     if left_out:
         blocks += [Heading(2, "Left out"), *bullets([*left_out])]
     if pictures:

@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from itertools import cycle
+from collections.abc import Container, Mapping, Sequence
+from itertools import cycle, pairwise
 from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
@@ -46,6 +46,7 @@ DRAWN = 3  # metrics at most, in one figure
 GRID = 40  # times at which a mean curve is drawn
 CROWD = 5  # configurations; of more, only the mean curves are drawn
 LEGEND_WIDTH = 88  # characters
+LEAST_SYSTEMS = 2  # in a diagram of systems
 ROOM = 1.5  # times the largest value, and part of the smallest, that a work-precision diagram shows of intervals
 PROFILE_POINT = "all switches as the profile has them"
 
@@ -63,6 +64,7 @@ def draw(results: Sequence[RunResult], folder: Path) -> list[tuple[Path, str]]:
         configs, headline = configurations(runs), runs[0].headline
         title = f"{protocol}, {profile} profile"
         drawn += _work_precision(configs, headline, folder / f"work-precision_{name}", title, data)
+        drawn += _systems(configs, headline, folder / f"systems_{name}", title, data)
         drawn += _quality_time(configs, headline, folder / f"quality-time_{name}", title, data)
     for (protocol, data), runs in same_protocol(results).items():
         name = _new(f"{plain_name(protocol)}_profiles-and-sizes", "", names)
@@ -87,42 +89,85 @@ def _work_precision(
     configs: Sequence[Configuration], headline: str, path: Path, title: str, about: str
 ) -> list[tuple[Path, str]]:
     configs, scenes = comparable(configs)
-    panels: dict[Identity, list[WorkPoint]] = {}
-    for i in dict.fromkeys(i for c in configs for run in c.runs for i in run.own):
-        points = [p for p in work_points(configs, i) if p.seconds.value > 0 and p.error.value > 0]
-        if i.region == headline and i.metric in METRICS and points and len(panels) < DRAWN:
-            panels[i] = points
+    panels = dict(list(_panels(configs, [headline], METRICS).items())[:DRAWN])
+    caption = (
+        f"Work-precision of {title} ({about}): error in region {headline} against seconds of fitting, both "
+        f"logarithmic; bars are {LEVEL:.0%} intervals over scenes, or over repeats of a single one, and "
+        "may run out of the picture."
+    )
+    return _diagram(panels, scenes, path, f"Work-precision: {title}", about, caption)
+
+
+def _systems(
+    configs: Sequence[Configuration], headline: str, path: Path, title: str, about: str
+) -> list[tuple[Path, str]]:
+    """Every system as its profile has it, by region, each point with its name. Nothing for fewer than two."""
+    configs, scenes = comparable([c for c in configs if not c.changed])
+    if len({c.method for c in configs}) < LEAST_SYSTEMS:
+        return []
+    panels = _panels(configs, [headline, *(r for r in PARTITION if r != headline)], ["psnr"])
+    caption = (
+        f"The systems of {title} ({about}), each as its profile has it: error against seconds of fitting by region, "
+        "both logarithmic. The dashed line is the Pareto set of a region: nothing is as fast and better. Bars are "
+        f"{LEVEL:.0%} intervals over scenes, and may run out of the picture."
+    )
+    return _diagram(panels, scenes, path, f"Systems: {title}", about, caption, named=True)
+
+
+def _panels(
+    configs: Sequence[Configuration], regions: Sequence[str], metrics: Container[str]
+) -> dict[Identity, list[WorkPoint]]:
+    """The points of every metric in every region, in the order of the regions."""
+    identities = dict.fromkeys(i for c in configs for run in c.runs for i in run.own if i.metric in metrics)
+    panels = {
+        i: [p for p in work_points(configs, i) if p.seconds.value > 0 and p.error.value > 0]
+        for region in regions
+        for i in identities
+        if i.region == region
+    }
+    return {i: points for i, points in panels.items() if points}
+
+
+def _diagram(
+    panels: Mapping[Identity, list[WorkPoint]],
+    scenes: Sequence[str],
+    path: Path,
+    title: str,
+    about: str,
+    caption: str,
+    named: bool = False,  # whether points have their names beside them, too
+) -> list[tuple[Path, str]]:
     if not panels:
         return []
-    drawn, axes = diagram.figure(len(panels), width=5.0, height=5.2)
+    columns = len(panels) if len(panels) <= DRAWN else 2
+    drawn, axes = diagram.figure(columns, -(-len(panels) // columns), width=5.0 + named, height=5.2 - named)
+    for spare in axes[len(panels) :]:
+        spare.set_axis_off()
     rows: list[dict[str, object]] = []
     handles: dict[str, Artist] = {}
     labels: list[tuple[Axes, list[diagram.Label], list[list[tuple[float, float]]]]] = []
-    for panel, (identity, points) in zip(axes, panels.items(), strict=True):
+    for panel, (identity, points) in zip(axes, panels.items(), strict=False):
         front = pareto(points)
         diagram.logarithmic(panel, _shown([p.seconds for p in points]), _shown([p.error for p in points]))
-        labels.append((panel, *_points(panel, points, handles)))
+        labels.append((panel, *_points(panel, points, handles, named)))
         steps = [_at(points[k]) for k in front]
         if len(steps) > 1:
+            corners = [(b[0], a[1]) for a, b in pairwise(steps)]
+            labels[-1][2].append([place for pair in zip(steps, corners, strict=False) for place in pair] + steps[-1:])
             (line,) = panel.plot(
                 *zip(*steps, strict=True), drawstyle="steps-post", color="#777777", ls="--", lw=1.1, zorder=1
             )
             handles.setdefault("Pareto set: nothing is as fast and better", line)
         _name_axes(panel, identity, f"seconds of fitting, mean of {len(scenes)} scene{'s' * (len(scenes) > 1)}")
         rows += [_csv_row(p, identity, k in front, len(scenes)) for k, p in enumerate(points)]
-    _finish(drawn, handles, f"Work-precision: {title}", about)
+    _finish(drawn, handles, title, about)
     for panel, beside, lines in labels:
         diagram.place_labels(panel, beside, lines)
-    caption = (
-        f"Work-precision of {title} ({about}): error in region {headline} against seconds of fitting, both "
-        f"logarithmic; bars are {LEVEL:.0%} intervals over scenes, or over repeats of a single one, and "
-        "may run out of the picture."
-    )
     return [(outputs.write_files(path, diagram.files(drawn, rows)), caption)]
 
 
 def _points(
-    panel: Axes, points: Sequence[WorkPoint], handles: dict[str, Artist]
+    panel: Axes, points: Sequence[WorkPoint], handles: dict[str, Artist], named: bool = False
 ) -> tuple[list[diagram.Label], list[list[tuple[float, float]]]]:
     """Draw the configurations, sweeps as lines; gives the texts that belong beside them, and the lines."""
     place = {id(p.configuration): p for p in points}
@@ -151,7 +196,7 @@ def _points(
         (point,) = panel.plot(*_at(p), color=colour, marker=mark, ms=size, ls="", zorder=4)
         _bars(panel, p, colour)
         handles.setdefault(f"{c.label}{f': {PROFILE_POINT}' if plain else ''}", point)
-        labels.setdefault(id(p), diagram.Label(_at(p), ""))
+        labels.setdefault(id(p), diagram.Label(_at(p), c.label if named else ""))
     return list(labels.values()), lines
 
 

@@ -94,6 +94,16 @@ class PaperRow:
     section: str = ""
     components: tuple[bool, ...] = ()
     printed: str = ""  # the paper's own mark on this row's numbers: best, second
+    source: str = ""  # of a row that another publication prints
+
+    def is_of(self, method: str) -> bool:
+        """Whether this is the row of a registered method: "3DGS-Avatar" is `3dgsavatar` or `3dgs_avatar`."""
+        return _letters(self.name) == _letters(method)
+
+    @property
+    def own(self) -> bool:
+        """The paper about its own method."""
+        return any(cell.status == "reported" for cell in self.cells)
 
 
 @dataclass(frozen=True)
@@ -107,6 +117,7 @@ class PaperTable:
     components: tuple[Component, ...] = ()
     notes: tuple[str, ...] = ()
     footnotes: Mapping[str, str] = field(default_factory=dict)
+    elsewhere: tuple[PaperRow, ...] = ()  # rows that other publications print, newer ones included
 
     @property
     def columns(self) -> tuple[Column, ...]:
@@ -133,6 +144,7 @@ def paper_table(name: str) -> PaperTable:
         source=f"{content['source']}, {raw['where']}",
         groups=tuple(groups),
         rows=tuple(map(_row, raw["row"])),
+        elsewhere=tuple(map(_row, raw.get("elsewhere", ()))),
         components=tuple(Component(**_fields(component)) for component in raw.get("component", ())),
         **_fields({key: raw[key] for key in ("notes", "footnotes") if key in raw}),
     )
@@ -154,4 +166,10 @@ def _row(raw: Mapping[str, Any]) -> PaperRow:
         for k, text in enumerate(raw["cells"])
     ]
     components = tuple(raw.get("components", ()))
-    return PaperRow(raw["name"], tuple(cells), raw.get("section", ""), components, raw.get("printed", ""))
+    more = (raw.get(key, "") for key in ("section", "printed", "source"))
+    section, printed, source = more
+    return PaperRow(raw["name"], tuple(cells), section, components, printed, source)
+
+
+def _letters(name: str) -> str:
+    return "".join(letter for letter in name.casefold() if letter.isalnum())

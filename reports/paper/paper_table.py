@@ -15,7 +15,18 @@ from typing import Literal
 
 import numpy as np
 
-from ihbench.document.document import Block, Heading, Number, Paragraph, RowLabel, Span, Table, bullets, emphasis
+from ihbench.document.document import (
+    Block,
+    Heading,
+    Number,
+    Paragraph,
+    RowLabel,
+    Span,
+    Table,
+    bullets,
+    emphasis,
+    spans,
+)
 from ihbench.document.marks import marks_by_interval, marks_by_value
 from ihbench.document.short_names import Footnotes, split_label
 from ihbench.metrics import Identity, Mean, macro_mean
@@ -25,7 +36,9 @@ from ihbench.record.row_choice import EVERYTHING, Choice
 from ihbench.record.row_labels import by_label
 from ihbench.record.scene_means import scene_means
 from ihbench.reports.general.significance import LEVEL
-from ihbench.reports.paper.paper_numbers import Column, Component, Group, PaperTable
+from ihbench.reports.paper.comparison import as_the_profile_has_it, beaten_notes, rank_note
+from ihbench.reports.paper.paper_numbers import Column, Component, Group, PaperRow, PaperTable
+from ihbench.scene.method_spec import usable_specs
 from ihbench.scene.protocol import REGIONS
 from ihbench.scoring.calibration import DESCRIPTIONS, ROWS
 
@@ -79,7 +92,9 @@ def build_frame(
         for shown in dict.fromkeys(choice.regions or (region,))
         for block in _measured(table, results, shown, bool(choice.regions), footnotes, choice)
     ]
-    tables = [_named(t, names, footnotes) for t in (quoted, *measured) if t.rows or not choice.rows]
+    elsewhere = [_elsewhere(table, footnotes)] if table.elsewhere and not choice.rows else []
+    blocks = (quoted, *elsewhere, *measured)
+    tables = [_named(t, names, footnotes) for t in blocks if t.rows or not choice.rows]
     tables = [replace(t, name=f"{table.name}-{k + 1}") for k, t in enumerate(tables)]
     notes = [*table.notes]
     if not measured:
@@ -108,23 +123,29 @@ def _columns_of(table: PaperTable, choice: Choice) -> PaperTable:
     if not choice.metrics:
         return table
     kept = [choice.has_metric(column.key) for column in table.columns]
-    rows = tuple(replace(row, cells=tuple(compress(row.cells, kept))) for row in table.rows)
+
+    def narrowed(rows: tuple[PaperRow, ...]) -> tuple[PaperRow, ...]:
+        return tuple(replace(row, cells=tuple(compress(row.cells, kept))) for row in rows)
+
     groups = [
         replace(group, columns=tuple(column for column in group.columns if choice.has_metric(column.key)))
         for group in table.groups
     ]
-    return replace(table, groups=tuple(group for group in groups if group.columns), rows=rows)
+    groups = tuple(group for group in groups if group.columns)
+    return replace(table, groups=groups, rows=narrowed(table.rows), elsewhere=narrowed(table.elsewhere))
 
 
 def _named(table: Table, names: Mapping[str, str], footnotes: Footnotes) -> Table:
-    """The table with the rows' chosen names; the switches that set another row apart go into a footnote."""
+    """The table with the rows' chosen names and their letters; switches that set a row apart become a footnote."""
     labels, rows = [], []
     for label, row in zip(table.labels, table.rows, strict=True):
         name, switches = split_label(label.name)
         if label.name in names or label.bound or not switches:
             name, switches = names.get(label.name, label.name), ""
         shown: str | Span = emphasis(name) if label.bound else name
-        rows.append(((shown, Span(footnotes.letter(switches), "raised")) if switches else shown, *row[1:]))
+        said = [piece.text for piece in spans(row[0])[1:] if isinstance(piece, Span)]
+        said += [footnotes.letter(switches)] if switches else []
+        rows.append(((shown, Span(", ".join(said), "raised")) if said else shown, *row[1:]))
         labels.append(replace(label, name=names.get(label.name, label.name)))
     return replace(table, labels=tuple(labels), rows=tuple(rows))
 
@@ -162,7 +183,7 @@ def _quoted(table: PaperTable, footnotes: Footnotes, as_printed: bool, choice: C
         "Marks are the paper's own." if as_printed else f"Marks are {marked} beyond chance.",
         *(group.note for group in table.groups if group.note and not group.measured_only),
     ]
-    parts = [part.name for part in table.components if not part.measured_only]
+    parts = _parts(table)
     return Table(
         (table.head, "status", *parts, *table.columns),
         tuple(rows),
@@ -173,6 +194,38 @@ def _quoted(table: PaperTable, footnotes: Footnotes, as_printed: bool, choice: C
         kind="quoted",
         notes=tuple(notes),
     )
+
+
+def _elsewhere(table: PaperTable, footnotes: Footnotes) -> Table:
+    """What other publications print, each row with its source. Nothing is marked: the rows are of several sources."""
+    rows = []
+    for row in table.elsewhere:
+        cells = [
+            Number("—", math.nan, "absent", reason="not noted from there")
+            if cell.status == "absent"
+            else Number(cell.text, cell.value, cell.status)
+            for cell in row.cells
+        ]
+        source = Span(footnotes.letter(f"Source: {row.source}."), "raised")
+        rows.append(((row.name, source), "quoted", *[NO] * len(_parts(table)), *cells))
+    return Table(
+        (table.head, "status", *_parts(table), *table.columns),
+        tuple(rows),
+        left=2,
+        ticks=len(_parts(table)),
+        labels=tuple(RowLabel(row.name, row.section) for row in table.elsewhere),
+        title="Quoted from elsewhere, not measured here",
+        kind="quoted elsewhere",
+        notes=(
+            "As other publications print them; whether their protocol is the paper's is not known.",
+            "printed otherwise: a row of the paper, with the cells that differ there. —: not noted from there.",
+        ),
+    )
+
+
+def _parts(table: PaperTable) -> list[str]:
+    """Components that the paper's own rows tell of."""
+    return [part.name for part in table.components if not part.measured_only]
 
 
 # -------------------------------------------------------------------------------------------------- measured rows
@@ -227,7 +280,7 @@ def _measured_block(
     choice: Choice,
 ) -> Table:
     everything = list({id(run): run for _, runs in filled for run in runs}.values())
-    labelled = by_label(_configured(everything))
+    labelled = _in_the_papers_order(table, by_label(_configured(everything)))
     order = choice.ordered({label: having[0].method for label, having in labelled.items()})
     labelled = {label: labelled[label] for label in order}
     kind: Kind = "stand-in" if standin else "real data"
@@ -241,6 +294,7 @@ def _measured_block(
     notes += [f"Not done: {run.method} on {_outcome(run)}." for run in unlabelled]
     columns: list[list[Number]] = []  # by column, then by row
     calibrations = choice.bounds([name for name in ROWS if any(name in run.rows for run in everything)])
+    systems = as_the_profile_has_it(labelled)
     for group, runs in filled:
         done = [run for run in runs if run.status == "done"]
         here = {id(run) for run in runs}
@@ -261,17 +315,31 @@ def _measured_block(
             )
             if marks.withheld:
                 notes.append(f"{column.group}, {column.metric.title}: {marks.withheld}.")
+            scores = zip(labelled, (scenes for _, scenes in ranked), strict=True)
+            notes += rank_note(table, column, {systems[label]: s for label, s in scores if label in systems})
             cells = [replace(cell, mark=mark) for (cell, _), mark in zip(ranked, marks.marks, strict=True)]
             for name in calibrations:
                 row = group_row(name, group.views)
                 cells.append(_bound(column, done, row, identity, kind, footnotes))
             columns.append(cells)
+        by_region = {
+            (where, column): {
+                method: _finite(group, [run for run in labelled[label] if id(run) in here], column.key, where)
+                for label, method in systems.items()
+            }
+            for where in dict.fromkeys(i.region for run in done for i in run.own)
+            for column in group.columns
+        }
+        notes += beaten_notes(table, group.name, by_region)
     parts = [tuple(_component(part, having) for part in table.components) for having in labelled.values()]
     parts += [(NO,) * len(table.components)] * len(calibrations)
     labels = [*map(RowLabel, labelled), *(RowLabel(name, bound=True) for name in calibrations)]
-    rows = [
-        (label.name, MEASURED[kind], *parts[k], *(cells[k] for cells in columns)) for k, label in enumerate(labels)
-    ]
+    said = {spec.name: spec.footnote for spec in usable_specs() if spec.footnote}
+    names: list[str | tuple[str | Span, ...]] = [label.name for label in labels]
+    for k, (label, having) in enumerate(labelled.items()):
+        if having[0].method in said:
+            names[k] = (label, Span(footnotes.letter(said[having[0].method]), "raised"))
+    rows = [(names[k], MEASURED[kind], *parts[k], *(cells[k] for cells in columns)) for k in range(len(labels))]
     notes.append(
         f"Mean over seeds within a scene, then over scenes, with the {LEVEL:.0%} interval over scenes. A mark says "
         "that the row differs from every other one over common scenes (interval of the paired difference)."
@@ -290,6 +358,26 @@ def _measured_block(
         paired=True,
         notes=tuple(notes),
     )
+
+
+def _in_the_papers_order(table: PaperTable, labelled: dict[str, list[RunResult]]) -> dict[str, list[RunResult]]:
+    """Rows of the paper's systems in its order, others behind them."""
+
+    def place(item: tuple[str, list[RunResult]]) -> int:
+        rows = (k for k, row in enumerate(table.rows) if row.is_of(item[1][0].method))
+        return next(rows, len(table.rows))
+
+    return dict(sorted(labelled.items(), key=place))
+
+
+def _finite(group: Group, runs: Sequence[RunResult], metric: str, region: str) -> dict[str, float]:
+    """Scene -> finite mean over seeds of a metric in a region; empty where there is none."""
+    done = [run for run in runs if run.status == "done"]
+    identity = _identity(done, group, metric, region)
+    if identity is None:
+        return {}
+    means = scene_means(done, identity, group_row(done[0].method, group.views))
+    return {scene: mean.value for scene, mean in means.items() if math.isfinite(mean.value)}
 
 
 def _identity(done: Sequence[RunResult], group: Group, metric: str, region: str) -> Identity | None:

@@ -6,6 +6,7 @@ import math
 
 import pytest
 
+from ihbench.document.document import spans
 from ihbench.reports.paper.paper_numbers import paper_table
 from ihbench.reports.paper.paper_table import build_frame
 from ihbench.scene.plan import Omission
@@ -63,7 +64,8 @@ def test_every_absent_cell_has_a_reason_and_every_letter_a_text():
         cells = [number for one in frame.tables for number in numbers(one)]
         assert all(c.reason for c in cells if c.status == "absent")
         assert all(math.isnan(c.value) == (c.status == "absent") for c in cells)
-        assert {letter for c in cells for letter in c.footnotes} == set(frame.footnotes)
+        named = {piece.text for one in frame.tables for row in one.rows for piece in spans(row[0])[1:]}  # at names
+        assert {letter for c in cells for letter in c.footnotes} | named == set(frame.footnotes)
 
 
 def test_without_runs_the_frame_says_so():
@@ -92,7 +94,7 @@ def test_stand_ins_and_real_data_never_share_a_block():
     assert any("not the data set" in note for note in made.notes)
     assert {c.status for c in numbers(made)} <= {"stand-in", "absent"}
     assert {c.status for c in numbers(real)} <= {"measured", "absent"}
-    assert [table.kind for table in frame.tables] == ["quoted", "real data", "stand-in"]
+    assert [table.kind for table in frame.tables] == ["quoted", "quoted elsewhere", "real data", "stand-in"]
 
 
 @pytest.mark.parametrize(
