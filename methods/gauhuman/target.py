@@ -11,11 +11,11 @@ from torch import Tensor
 
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
+from ihbench.fit.big_pose.deformation import Frame
 from ihbench.fit.body_box import body_box
 from ihbench.fit.losses import Perceptual, dissimilarity, masked_mean, where_known
 from ihbench.methods.gauhuman.avatar import GauHumanAvatar
 from ihbench.methods.gauhuman.config import GauHumanConfig
-from ihbench.methods.gauhuman.deformation import Frame
 from ihbench.render.zbuffer import rasterize
 from ihbench.scene.contracts import MaskState, TrainView
 

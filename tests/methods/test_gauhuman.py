@@ -12,6 +12,7 @@ from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput, Diverged
+from ihbench.fit.big_pose.fitting import pixel_size, rates
 from ihbench.fit.gaussians.gaussian_set import Gaussians
 from ihbench.fit.gaussians.neighbours import distance_to
 from ihbench.methods.gauhuman.config import (
@@ -23,7 +24,7 @@ from ihbench.methods.gauhuman.config import (
     GauHumanConfig,
     leave_out,
 )
-from ihbench.methods.gauhuman.fitting import GauHumanFit, density, pixel_size, rates
+from ihbench.methods.gauhuman.fitting import GauHumanFit, density
 from ihbench.methods.gauhuman.method import GauHuman
 from ihbench.methods.gauhuman.target import BLACK, Target, box_loss, prepare_target
 from ihbench.render.splat import render_gaussians
@@ -348,7 +349,7 @@ def test_the_method_reports_its_stages_and_offers_its_avatar(views):
 
 
 def test_lpips_without_its_weights_is_off_and_said_so(views, monkeypatch):
-    monkeypatch.setattr("ihbench.methods.gauhuman.fitting.perceptual", lambda net, device: f"no weights of {net}")
+    monkeypatch.setattr("ihbench.fit.big_pose.fitting.perceptual", lambda net, device: f"no weights of {net}")
     ledger = Ledger()
     avatar = fitted(training_set(views), ledger=ledger, lpips=0.01)
     assert events(ledger, "left_out") == [{"what": "lpips term", "reason": "no weights of vgg"}]

@@ -11,11 +11,11 @@ from ihbench.body.pose import BodyPose
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput
+from ihbench.fit.big_pose.deformation import Deformation, inverse
 from ihbench.fit.gaussians.density import divergence_to_nearest
 from ihbench.fit.gaussians.gaussian_set import Gaussians
 from ihbench.fit.gaussians.skinned_covariance import skinned_covariance
 from ihbench.methods.gauhuman.config import OCCGAUHUMAN_PROFILES, PAPER, PROFILES
-from ihbench.methods.gauhuman.deformation import Deformation, inverse
 from tests.bench.fake_capture import a_camera, a_pose, the_body
 
 from .tiny_fit import random_pose

@@ -1,0 +1,155 @@
+"""The avatar: anisotropic Gaussians in the big pose, skinned to a frame and splatted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Generic, Self, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from ihbench.body import Body
+from ihbench.body.pose import BodyPose
+from ihbench.camera import Camera
+from ihbench.config_fields import read
+from ihbench.fit.avatar_files import read_avatar, write_avatar
+from ihbench.fit.big_pose.config import BigPoseConfig
+from ihbench.fit.big_pose.deformation import Deformation, Frame, Posed
+from ihbench.fit.gaussians.gaussian_set import SHAPES, Gaussians
+from ihbench.fit.gaussians.posed import PosedGaussians
+from ihbench.fit.gaussians.skinned_covariance import skinned_covariance
+from ihbench.nets.pose_correction import PoseCorrection
+from ihbench.nets.weight_offsets import WeightOffsets
+from ihbench.render.splat import render_gaussians
+
+Y00 = 0.28209479177387814  # the spherical harmonic of degree 0
+VERTEX = "vertex"  # what each Gaussian carries: the canonical vertex that it takes its weights from
+DC, REST = "sh_dc", "sh_rest"  # attributes: spherical harmonics of degree 0, and above
+
+
+Config = TypeVar("Config", bound=BigPoseConfig)
+
+
+class BigPoseAvatar(nn.Module, Generic[Config]):
+    """Gaussians that start on the vertices of the big pose at mean shape, grey, round and of opacity .1, with the two
+    networks that correct pose and weights. `degree` is that of the spherical harmonics in use. A method's own avatar
+    names its `kind` and its configuration."""
+
+    kind: ClassVar[str]
+    config_class: ClassVar[type[BigPoseConfig]]
+
+    def __init__(self, config: Config, body: Body, seed: int):
+        super().__init__()
+        self.config, self.body = config, body
+        self.degree = 0
+        self.deformation = Deformation(body).float()
+        vertices = self.deformation.vertices
+        n, above = len(vertices), (config.highest_degree + 1) ** 2 - 1
+        colours = {DC: torch.full((n, 1, 3), (config.grey - 0.5) / Y00)}
+        if above:
+            colours[REST] = torch.zeros(n, above, 3)
+        self.gaussians = Gaussians.on(vertices, config.opacity, colours, {VERTEX: torch.arange(n)})
+        generator = torch.Generator().manual_seed(seed)
+        self.pose_correction = PoseCorrection(generator) if config.pose_network else None
+        self.weight_offsets = WeightOffsets(seed) if config.weight_network else None
+
+    def __len__(self) -> int:
+        return len(self.gaussians)
+
+    @property
+    def device(self) -> torch.device:
+        return self.gaussians.means.device
+
+    @property
+    def sh(self) -> Tensor:
+        """[N, (degree + 1)², 3] the spherical harmonics in use."""
+        attributes = self.gaussians.attributes
+        above = (self.degree + 1) ** 2 - 1
+        return torch.cat([attributes[DC], attributes[REST][:, :above]], 1) if above else attributes[DC]
+
+    def posed(self, frame: Frame, vertex: Tensor | None = None) -> Posed:  # vertex [N] int64
+        """The Gaussians in a frame; by the vertices that they carry unless others are given."""
+        means = self.gaussians.means
+        return self.deformation(
+            means,
+            self.gaussians.carried(VERTEX) if vertex is None else vertex,
+            frame,
+            self.weight_offsets(means) if self.weight_offsets is not None else None,
+            self.pose_correction(frame.pose) if self.pose_correction is not None else None,
+        )
+
+    def covariances(self, posed: Posed) -> Tensor:
+        """[N, 3, 3] m², world."""
+        return skinned_covariance(self.gaussians.scales, self.gaussians.quaternions, posed.linear)
+
+    def draw(
+        self,
+        posed: Posed,
+        camera: Camera,
+        background: Sequence[float],
+        outputs: Sequence[str] = ("rgb", "alpha"),
+    ) -> tuple[Any, ...]:
+        """What `render_gaussians` draws of Gaussians that are posed."""
+        return render_gaussians(
+            posed.means,
+            self.covariances(posed),
+            self.sh,
+            camera,
+            background,
+            opacities=self.gaussians.opacities,
+            sh_degree=self.degree,
+            preset="3dgs",
+            outputs=outputs,
+        )
+
+    def refresh_vertices(self) -> None:
+        """Let each Gaussian carry the vertex that is nearest to it now."""
+        self.gaussians.carried(VERTEX).copy_(self.deformation.nearest(self.gaussians.means))
+
+    @torch.no_grad()
+    def posed_gaussians(self, body_pose: BodyPose) -> PosedGaussians:
+        """As they are drawn; see `scene.contracts.Avatar`."""
+        vertex = self.deformation.nearest(self.gaussians.means)
+        posed = self.posed(self.deformation.frame(body_pose), vertex)
+        opacities = self.gaussians.opacities
+        return PosedGaussians(posed.means, self.covariances(posed), self.sh, None, opacities, self.degree)
+
+    def render(
+        self,
+        camera: Camera,
+        body_pose: BodyPose,
+        background: tuple[float, float, float] = (1.0, 1.0, 1.0),
+        frame: int | None = None,  # nothing is learned for single frames
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """rgb [H, W, 3] on `background` and alpha [H, W]; see `scene.contracts.Avatar`. As released, the pose network
+        corrects any pose, also those that nobody trained on."""
+        with torch.no_grad():
+            vertex = self.deformation.nearest(self.gaussians.means)
+            rgb, alpha = self.draw(self.posed(self.deformation.frame(body_pose), vertex), camera, background)
+        return rgb.clamp(0, 1).cpu().numpy(), alpha.clamp(0, 1).cpu().numpy()
+
+    def save(self, folder: Path) -> None:
+        """Write `avatar.safetensors` and `avatar.json`: enough to load it again beside the same body.
+
+        Raises `BadInput` when the disk does not take it.
+        """
+        write_avatar(folder, self.kind, self, self.config, self.body, degree=self.degree)
+
+    @classmethod
+    def load(cls, folder: Path, body: Body, device: str = "cpu") -> Self:
+        """Read what `save` wrote. Raises `BadInput` for a missing or foreign file or another body."""
+        saved = read_avatar(folder, cls.kind, body)
+        with saved.put_together():
+            tensors = saved.tensors
+            avatar = cls(read(cls.config_class, saved.words["config"], "avatar.json: config"), body, seed=0)
+            own = "gaussians.attributes."
+            learned = {name: tensors[own + name] for name in avatar.gaussians.attributes}
+            carried = {VERTEX: tensors[f"gaussians.carried_{VERTEX}"]}
+            means, log_scales, quaternions, opacity_logits = (learned.pop(name) for name in SHAPES)
+            avatar.gaussians = Gaussians(means, log_scales, quaternions, opacity_logits, learned, carried)
+            avatar.load_state_dict(tensors)
+            avatar.degree = min(max(int(saved.words["degree"]), 0), avatar.config.highest_degree)
+        return avatar.to(device)
