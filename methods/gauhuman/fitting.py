@@ -9,11 +9,11 @@ from torch import Tensor
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.fit.big_pose.fitting import TARGETS_HELD, BigPoseFit, with_pixels
+from ihbench.fit.big_pose.target import BLACK, Colour, box_loss, prepare_target
 from ihbench.fit.gaussians.density_config import DensityConfig
 from ihbench.methods.gauhuman.avatar import GauHumanAvatar
 from ihbench.methods.gauhuman.config import GauHumanConfig
 from ihbench.methods.gauhuman.spec import STATE
-from ihbench.methods.gauhuman.target import BLACK, Colour, box_loss, prepare_target
 from ihbench.scene.contracts import TrainingSet
 from ihbench.scene.views import LazyViews
 

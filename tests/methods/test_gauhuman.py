@@ -13,6 +13,7 @@ from ihbench.clock.progress import Progress
 from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput, Diverged
 from ihbench.fit.big_pose.fitting import pixel_size, rates
+from ihbench.fit.big_pose.target import BLACK, Target, box_loss, prepare_target
 from ihbench.fit.gaussians.gaussian_set import Gaussians
 from ihbench.fit.gaussians.neighbours import distance_to
 from ihbench.methods.gauhuman.config import (
@@ -26,7 +27,6 @@ from ihbench.methods.gauhuman.config import (
 )
 from ihbench.methods.gauhuman.fitting import GauHumanFit, density
 from ihbench.methods.gauhuman.method import GauHuman
-from ihbench.methods.gauhuman.target import BLACK, Target, box_loss, prepare_target
 from ihbench.render.splat import render_gaussians
 from ihbench.scene.contracts import MaskState
 from ihbench.scene.method_spec import method_spec

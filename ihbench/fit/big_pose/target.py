@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -11,16 +12,37 @@ from torch import Tensor
 
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
+from ihbench.fit.big_pose.avatar import BigPoseAvatar
 from ihbench.fit.big_pose.deformation import Frame
 from ihbench.fit.body_box import body_box
 from ihbench.fit.losses import Perceptual, dissimilarity, masked_mean, where_known
-from ihbench.methods.gauhuman.avatar import GauHumanAvatar
-from ihbench.methods.gauhuman.config import GauHumanConfig
 from ihbench.render.zbuffer import rasterize
 from ihbench.scene.contracts import MaskState, TrainView
 
 Colour = tuple[float, float, float]
 BLACK: Colour = (0.0, 0.0, 0.0)
+
+
+class BoxLossConfig(Protocol):
+    """Switches of a method whose loss this is."""
+
+    @property
+    def unknown(self) -> str: ...  # what a hidden pixel is taken for: background, or ignore: nothing
+
+    @property
+    def colours(self) -> str: ...  # where colours are compared: everywhere in the box, or where the person is visible
+
+    @property
+    def silhouette(self) -> str: ...  # what alpha is held to: the visible person, or the complete one
+
+    @property
+    def mask(self) -> float: ...
+
+    @property
+    def ssim(self) -> float: ...
+
+    @property
+    def lpips(self) -> float: ...
 
 
 @dataclass(frozen=True)
@@ -39,10 +61,11 @@ class Target:
     blind: Tensor  # [h, w, 1] 1 where a window compares the rendering with itself
 
 
-def prepare_target(avatar: GauHumanAvatar, view: TrainView, background: Colour) -> Target:
+def prepare_target(avatar: BigPoseAvatar[Any], view: TrainView, background: Colour) -> Target:
     """Cut a view to the box around the posed body, as the configuration takes its mask. `background` is what the
     person is to stand on."""
-    config, body_pose = avatar.config, view.body_pose
+    config: BoxLossConfig = avatar.config
+    body_pose = view.body_pose
     box = body_box(view.camera, avatar.body.pose(body_pose))
     x0, y0, width, height = box.window
     camera = view.camera.cropped(x0, y0, width, height)
@@ -53,7 +76,7 @@ def prepare_target(avatar: GauHumanAvatar, view: TrainView, background: Colour) 
     image = np.where(visible[..., None], image, np.array(background, np.float32))
     person = visible
     if config.silhouette == "complete":
-        person = visible | (unknown & _silhouette(avatar, camera, body_pose))
+        person = visible | (unknown & body_silhouette(avatar, camera, body_pose))
     ignored = unknown & (config.unknown == "ignore")
     colours = box.inside & (visible if config.colours == "visible" else ~ignored)
     # alpha of hidden pixels is known where the silhouette is complete
@@ -77,7 +100,7 @@ def prepare_target(avatar: GauHumanAvatar, view: TrainView, background: Colour) 
     )
 
 
-def _silhouette(avatar: GauHumanAvatar, camera: Camera, body_pose: BodyPose) -> NDArray[np.bool_]:
+def body_silhouette(avatar: BigPoseAvatar[Any], camera: Camera, body_pose: BodyPose) -> NDArray[np.bool_]:
     """[h, w] what the posed body covers."""
     vertices = camera.project(avatar.body.pose(body_pose))
     return rasterize(vertices, avatar.body.faces, camera.height, camera.width).mask
@@ -87,7 +110,7 @@ def box_loss(
     rgb: Tensor,  # [h, w, 3]
     alpha: Tensor,  # [h, w]
     target: Target,
-    config: GauHumanConfig,
+    config: BoxLossConfig,
     perceptual: Perceptual | None = None,
 ) -> Tensor:
     """Mean L1 and squared error of alpha over pixels of the box, 1 - SSIM and LPIPS over the window around it."""
