@@ -102,7 +102,8 @@ class PosedSurface:
         self._normals = triangle_normals(self._corners)
         self._front = (self._normals * (camera.center - self._corners[:, 0])).sum(1) > 0
 
-    def faced(self, texels: Texels) -> FacedTexels:
+    def faced(self, texels: Texels, facing: float = FACING, slack: float = DEPTH_SLACK) -> FacedTexels:
+        """Those turned to the camera by a cosine above `facing` and at most `slack` m behind the nearest surface."""
         camera = self.camera
         texel = np.flatnonzero(self._front[texels.face])
         face = texels.face[texel]
@@ -110,13 +111,13 @@ class PosedSurface:
         to_camera = camera.center - points
         to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
         cosine = (self._normals[face] * to_camera).sum(1)
-        facing = cosine > FACING
-        texel, cosine = texel[facing], cosine[facing]
-        p = camera.project(points[facing])
+        turned = cosine > facing
+        texel, cosine = texel[turned], cosine[turned]
+        p = camera.project(points[turned])
         inside = (p[:, 2] > 0) & (p[:, :2] >= 0).all(1) & (p[:, 0] < camera.width) & (p[:, 1] < camera.height)
         texel, cosine, p = texel[inside], cosine[inside], p[inside]
         column, row = p[:, :2].astype(np.int64).T
-        nearest = p[:, 2] <= self._depth[row, column] + DEPTH_SLACK
+        nearest = p[:, 2] <= self._depth[row, column] + slack
         return FacedTexels(texel[nearest], p[nearest, :2], cosine[nearest])
 
 

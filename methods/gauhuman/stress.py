@@ -1,34 +1,21 @@
-"""Stiff training of GauHuman: few steps, a person of six small frames, and everything that goes wrong.
-
-Named in the spec. A case's note says which steps the guard rejected and where it went back to.
-"""
+"""Stiff training of GauHuman and OccGauHuman: what is asked of every such fit (`stress.fit_cases`), and density
+control of a single Gaussian. Named in the spec."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
-
-import numpy as np
 
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.errors import BadInput
 from ihbench.fit.gaussians.density_config import DensityConfig
 from ihbench.methods.gauhuman.config import OCCLUDED, SMOKE, GauHumanConfig
 from ihbench.methods.gauhuman.method import GauHuman
-from ihbench.scene.contracts import MaskState, TrainingSet, TrainView
-from ihbench.stress.case import Answer, Case, words_of
-from ihbench.stress.six_views import (
-    all_unknown,
-    training_set,
-    views,
-    with_bad_hidden_pixels,
-    with_bad_pixel,
-)
-from ihbench.stress.training import story_of_fit
+from ihbench.scene.contracts import TrainingSet
+from ihbench.stress.case import Answer
+from ihbench.stress.fit_cases import FitCases
+from ihbench.stress.six_views import training_set, views
 
 # changes of the set after 12 and 15 of 18 steps; no reset, which so few steps do not outlive; without the network of
 # the weights, which takes most of a step's time
@@ -43,83 +30,15 @@ TINY = replace(
 )
 RATES = ("lr_position", "lr_scale", "lr_rotation", "lr_opacity", "lr_colour", "lr_networks")
 
-HELPS = "the error of alpha over the views after the fit, over that before: a fit that does not lower it is none"
-STEP = "a step is counted"
-REFUSED = "it must be refused, and the line must say this"
+
+def fit(config: GauHumanConfig, training: TrainingSet, ledger: Ledger) -> Any:
+    return GauHuman(config).fit(training, device="cpu", seed=0, ledger=ledger, progress=Progress.silent())
 
 
-def fit(config: GauHumanConfig, training: TrainingSet | None = None, ledger: Ledger | None = None) -> Any:
-    return GauHuman(config).fit(
-        training or training_set(), device="cpu", seed=0, ledger=ledger or Ledger(), progress=Progress.silent()
-    )
-
-
-def story(config: GauHumanConfig, training: TrainingSet | None = None) -> tuple[Any, str]:
-    """The avatar, None where it diverged, and what happened on the way."""
-    ledger = Ledger()
-    return story_of_fit(lambda: fit(config, training, ledger), ledger)
-
-
-def error_of_alpha(avatar: Any, training: TrainingSet) -> float:
-    """Mean squared, where it is known whether the person is there."""
-    errors = []
-    for view in training.views:
-        alpha = avatar.render(view.camera, view.body_pose)[1]
-        known = view.mask != MaskState.UNKNOWN
-        errors.append(np.square(alpha - (view.mask == MaskState.PERSON))[known])
-    return float(np.concatenate(errors).mean())
-
-
-def _ratio(config: GauHumanConfig, training: TrainingSet | None = None) -> Answer:
-    """Error after over error before."""
+def start(config: GauHumanConfig, training: TrainingSet) -> Any:
     from ihbench.methods.gauhuman.avatar import GauHumanAvatar
 
-    training = training or training_set()
-    after, what = story(config, training)
-    before = error_of_alpha(GauHumanAvatar(config, training.body, 0), training)
-    return Answer(math.nan if after is None else error_of_alpha(after, training) / before, 1.0, note=what)
-
-
-def scaled_rates(factor: float) -> GauHumanConfig:
-    config = replace(TINY)
-    for name in RATES:  # past the switches' bounds: the guard of a fit must hold whatever reaches it
-        object.__setattr__(config, name, factor * getattr(TINY, name))
-    return config
-
-
-def _survives(factor: float) -> Answer:
-    """Either the fit ends with a finite avatar, or it is a divergence with its first bad step: never a crash, never
-    NaN in a picture."""
-    after, what = story(scaled_rates(factor))
-    if after is None:
-        return Answer(what, "diverged, first bad step")
-    rgb, alpha = after.render(views()[0].camera, views()[0].body_pose)
-    return Answer(f"finite {bool(np.isfinite(rgb).all() and np.isfinite(alpha).all())}: {what}", "finite True")
-
-
-def _empty_mask(**changes: Any) -> Answer:
-    """Views in which the person is wholly hidden, among others."""
-    return _ratio(replace(TINY, **changes), training_set([views()[0], *all_unknown()[1:3], *views()[3:]]))
-
-
-def _nothing(shown: Sequence[TrainView]) -> Answer:
-    return Answer(words_of(BadInput, lambda: fit(TINY, training_set(shown))), "nothing to fit")
-
-
-def _all_pruned() -> Answer:
-    return Answer(story(replace(TINY, density=replace(TINY.density, faint=1.0)))[1], "would prune all of")
-
-
-def _bad_pixel(bad: float) -> Answer:
-    """One pixel of one view is not finite; smaller steps cannot help, so none is tried."""
-    after, what = story(TINY, with_bad_pixel(2, bad))
-    assert after is None
-    return Answer(what, "loss is ")
-
-
-def _hidden_bad_pixel() -> Answer:
-    """A NaN behind the occluder is nobody's business."""
-    return _ratio(TINY, with_bad_hidden_pixels(1, math.nan))
+    return GauHumanAvatar(config, training.body, 0)
 
 
 def _one_gaussian() -> Answer:
@@ -133,39 +52,23 @@ def _one_gaussian() -> Answer:
     return Answer(float(divergence_to_nearest(alone)[0][0]), math.inf)
 
 
-def _training(
-    name: str, what: str, function: Callable[[], Answer], unit: Any, why: str, method: str = "gauhuman"
-) -> Case:
-    return Case(f"{method}-{name}", what, function, unit, 0, why, "training")
-
-
-_helps = partial(_training, unit="at most", why=HELPS)
-_step = partial(_training, unit="words", why=STEP)
-_refused = partial(_training, unit="words", why=REFUSED)
+OURS = FitCases("gauhuman", TINY, RATES, fit, start)
+OCCLUDED_ONES = FitCases("occgauhuman", replace(TINY, **OCCLUDED), RATES, fit, start)
 
 CASES = [
-    _helps("rate-1", "step sizes as they are", lambda: _ratio(replace(TINY, weight_network=True))),
-    *(
-        _step(f"rate-{factor:g}", f"step sizes × {factor:g}", partial(_survives, factor))
-        for factor in (100.0, 1e4, 1e30)
+    *OURS.usual(
+        replace(TINY, weight_network=True),
+        replace(TINY, unknown="ignore"),
+        replace(TINY, density=replace(TINY.density, faint=1.0)),
     ),
-    _helps("one-frame", "one training frame", lambda: _ratio(TINY, training_set(views()[:1]))),
-    _helps("empty-mask", "two frames without a visible pixel", partial(_empty_mask, unknown="ignore")),
-    _refused("no-view", "no training view", partial(_nothing, [])),
-    _refused("all-hidden", "views without a visible pixel",
-             lambda: _nothing(all_unknown())),
-    _step("all-pruned", "an opacity of 1 is asked of every Gaussian", _all_pruned),
-    _step("nan-pixel", "a NaN among the person's pixels", partial(_bad_pixel, math.nan)),
-    _step("inf-pixel", "an infinite person pixel", partial(_bad_pixel, math.inf)),
-    _helps("nan-hidden", "NaN behind the occluder", _hidden_bad_pixel),
-    _training("one-gaussian", "the divergence of a Gaussian from its nearest neighbour, without any", _one_gaussian,
+    OURS.case("one-gaussian", "the divergence of a Gaussian from its nearest neighbour, without any", _one_gaussian,
               "absolute", "infinite: it may grow, never merge"),
 ]  # fmt: skip
 
 OCCLUDED_CASES = [
-    _helps("rate-1", "step sizes as they are", lambda: _ratio(replace(TINY, **OCCLUDED)), method="occgauhuman"),
-    _helps("one-frame", "one training frame",
-           lambda: _ratio(replace(TINY, **OCCLUDED), training_set(views()[1:2])), method="occgauhuman"),
-    _helps("empty-mask", "two frames without a visible pixel", partial(_empty_mask, **OCCLUDED),
-           method="occgauhuman"),
+    OCCLUDED_ONES.helps("rate-1", "step sizes as they are", lambda: OCCLUDED_ONES.ratio(OCCLUDED_ONES.tiny)),
+    OCCLUDED_ONES.helps("one-frame", "one training frame",
+                        lambda: OCCLUDED_ONES.ratio(OCCLUDED_ONES.tiny, training_set(views()[1:2]))),
+    OCCLUDED_ONES.helps("empty-mask", "two frames without a visible pixel",
+                        lambda: OCCLUDED_ONES.empty_masks(OCCLUDED_ONES.tiny)),
 ]  # fmt: skip

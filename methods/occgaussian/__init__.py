@@ -1,0 +1,1 @@
+"""OccGaussian (Ye, Zhang, Liao, ICMR 2025), rebuilt; its details are inferred."""
