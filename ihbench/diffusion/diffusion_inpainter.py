@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,20 @@ from ihbench.diffusion.sampling import inpaint_views
 from ihbench.diffusion.subject_token import ANYBODY, new_words
 
 
-def load_backbone(config: InpaintConfig, device: str) -> Backbone:
+class BackboneChoice(Protocol):
+    """Which backbone, of which weights: switches that a method's configuration has under `--method.inpaint`."""
+
+    @property
+    def backbone(self) -> str: ...  # "mini" or "sd2"
+    @property
+    def weights(self) -> str: ...
+    @property
+    def control_weights(self) -> str: ...
+    @property
+    def memory_lean(self) -> bool: ...
+
+
+def load_backbone(config: BackboneChoice, device: str) -> Backbone:
     """The backbone that a configuration names. Raises `BadInput` for weights that are missing, wrong or damaged."""
     if config.backbone == "sd2":
         from ihbench.diffusion.sd2_weights import load_sd2
@@ -29,18 +43,22 @@ def load_backbone(config: InpaintConfig, device: str) -> Backbone:
     return load_mini(Path(config.weights) if config.weights else None, device)
 
 
-def check_backbone(config: InpaintConfig) -> None:
-    """Raises `BadInput` for what `load_backbone` and personalisation would complain of and a look at the folders can
-    tell, before an hour of fitting."""
+def look_at_backbone(config: BackboneChoice) -> Any:
+    """The tokenizer of the backbone. Raises `BadInput` for what `load_backbone` would complain of and a look at the
+    folders can tell, before an hour of fitting."""
     if config.backbone == "sd2":
         from ihbench.diffusion.sd2_weights import look_at_sd2
 
-        tokenizer = look_at_sd2(config.weights, config.control_weights or None).tokenizer
-    else:
-        from ihbench.diffusion.mini.folder import SHIPPED, check_mini
-        from ihbench.diffusion.mini.weights import mini_tokenizer
+        return look_at_sd2(config.weights, config.control_weights or None).tokenizer
+    from ihbench.diffusion.mini.folder import SHIPPED, check_mini
+    from ihbench.diffusion.mini.weights import mini_tokenizer
 
-        tokenizer = mini_tokenizer(check_mini(Path(config.weights) if config.weights else SHIPPED)[0])
+    return mini_tokenizer(check_mini(Path(config.weights) if config.weights else SHIPPED)[0])
+
+
+def check_backbone(config: InpaintConfig) -> None:
+    """Raises `BadInput` as `look_at_backbone`, and for what personalisation would complain of."""
+    tokenizer = look_at_backbone(config)
     if config.ti:
         new_words(tokenizer, config.token, config.settled().vectors, config.backbone)
 

@@ -30,10 +30,13 @@ def sample(
     use_parts: bool,
     guidance: float = 1.0,
     negative: str = "",
+    control_scale: float = 1.0,
+    guess: bool = False,
 ) -> Tensor:
     """[B, 3, H, W] in [-1, 1]: what the model paints, known pixels not yet put back.
 
-    `guidance` above 1 is classifier-free guidance against the prompt `negative`.
+    `guidance` above 1 is classifier-free guidance against the prompt `negative`. `control_scale` is of what the
+    ControlNet adds; with `guess` (diffusers' guess mode) it guides the prompted half alone, less at fine levels.
     """
     scheduler = backbone.scheduler
     scheduler.set_timesteps(steps, device=backbone.device)
@@ -44,7 +47,7 @@ def sample(
     latents = noise.expand(len(batch), *noise.shape[-3:]).to(backbone.dtype) * scheduler.init_noise_sigma
     for t in scheduler.timesteps:
         given = scheduler.scale_model_input(latents, t)
-        predicted = _predict(backbone, given, t, condition, text, guide, guidance)
+        predicted = _predict(backbone, given, t, condition, text, guide, guidance, control_scale, guess)
         latents = scheduler.step(predicted, t, latents, return_dict=False)[0]
     return backbone.codec.decode(latents).float().clamp(-1, 1)
 
@@ -57,13 +60,20 @@ def _predict(
     text: Tensor,
     guide: Tensor | None,
     guidance: float,
+    control_scale: float,
+    guess: bool,
 ) -> Tensor:
     n = len(noisy)
     times = t.expand(n)
-    said = backbone.predict(noisy, times, condition, text[:1].expand(n, -1, -1), guide)
+    said = backbone.predict(
+        noisy, times, condition, text[:1].expand(n, -1, -1), guide, control_scale=control_scale, guess=guess
+    )
     if len(text) == 1:
         return said
-    unsaid = backbone.predict(noisy, times, condition, text[1:].expand(n, -1, -1), guide)
+    negative = text[1:].expand(n, -1, -1)
+    unsaid = backbone.predict(
+        noisy, times, condition, negative, None if guess else guide, control_scale=control_scale
+    )
     return unsaid + guidance * (said - unsaid)
 
 
@@ -80,12 +90,17 @@ def inpaint_views(
     noise_scale: float = 1.0,
     batch: int = 8,
     ledger: Ledger | None = None,
+    state: str = STATE,
+    negative: str = "",
+    control_scale: float = 1.0,
+    guess: bool = False,
 ) -> list[NDArray[np.uint8]]:
     """One completed crop per view. A batch that does not fit into memory is halved; when a single crop does not fit,
     `BadInput` says so. `Diverged` for a result that is not finite. With a run's ledger a killed call goes on behind
-    the last batch saved; the batches, and so the pixels, are those of a call that was not killed."""
+    the last batch saved, as `state`; the batches, and so the pixels, are those of a call that was not killed. What
+    guides is as in `sample`."""
     out: list[NDArray[np.uint8]] = [view.image for view in views]
-    done = _restored(ledger, out)
+    done = _restored(ledger, out, state)
     todo = {k for k, view in enumerate(views) if view.unknown.any()}
     with progress.task("inpainting", len(todo)) as task:
         task.advance(len(done))
@@ -99,7 +114,8 @@ def inpaint_views(
                 try:
                     painted = sample(
                         backbone, batch_of([views[k] for k in now], backbone.device), noise, prompt,
-                        steps=steps, use_parts=use_parts, guidance=guidance,
+                        steps=steps, use_parts=use_parts, guidance=guidance, negative=negative,
+                        control_scale=control_scale, guess=guess,
                     )  # fmt: skip
                 except (MemoryError, RuntimeError) as error:
                     size = f"{width}×{backbone.size} px"
@@ -114,17 +130,17 @@ def inpaint_views(
                 task.advance(len(now))
                 done.update(now)
                 if ledger is not None and ledger.due_to_save() and len(done) < len(todo):
-                    ledger.save_state(STATE, {f"{k}": out[k] for k in done}, {"step": len(done)})
+                    ledger.save_state(state, {f"{k}": out[k] for k in done}, {"step": len(done)})
     return out
 
 
-def _restored(ledger: Ledger | None, out: list[NDArray[np.uint8]]) -> set[int]:
+def _restored(ledger: Ledger | None, out: list[NDArray[np.uint8]], state: str) -> set[int]:
     """Put the crops that a killed call has saved into `out`; their numbers."""
-    saved = None if ledger is None else ledger.load_state(STATE)
+    saved = None if ledger is None else ledger.load_state(state)
     if ledger is None or saved is None:
         return set()
     tensors, meta = saved
     for k, image in tensors.items():
         out[int(k)] = np.asarray(image)
-    ledger.event(Resumed(STATE, meta["step"]))
+    ledger.event(Resumed(state, meta["step"]))
     return {int(k) for k in tensors}

@@ -54,8 +54,12 @@ class CropView:
 def cut_view(view: TrainView, index: int, body: Body, size: int, square: bool = False) -> CropView:
     """Cut a training view to the padded box of its body, `size` px tall. What lies outside the image counts as known
     background: nothing can be learned or painted there."""
+    return cut_to(view, index, body, person_crop(view.camera, body.pose(view.body_pose), size, square=square))
+
+
+def cut_to(view: TrainView, index: int, body: Body, crop: PersonCrop) -> CropView:
+    """Cut a training view to a crop, as `cut_view`."""
     vertices = body.pose(view.body_pose)
-    crop = person_crop(view.camera, vertices, size, square=square)
     image = crop.cut(view.image, 255)
     unknown = crop.cut(view.mask == MaskState.UNKNOWN) > EDGE
     person = crop.cut(view.mask == MaskState.PERSON) >= 0.5
