@@ -95,6 +95,10 @@ class Backbone:
         text: Tensor,  # [B, L, D]
         guide: Tensor | None,  # [B, 3 or 7, H, W] in [0, 1], of which the ControlNet takes as many as it knows;
         # None leaves it out
+        *,
+        control_text: Tensor | None = None,  # [B, L, D] what the ControlNet is told; None: the same as the UNet
+        control_scale: float = 1.0,  # of what the ControlNet adds
+        guess: bool = False,  # diffusers' guess mode: from a tenth of it at the finest level to all at the coarsest
     ) -> Tensor:
         """What the scheduler's `prediction_type` says: noise, velocity or the clean latents."""
         noisy = noisy.to(self.dtype)  # the autoencoder may be kept in fp32
@@ -102,8 +106,9 @@ class Backbone:
         if guide is not None:
             guide = guide[:, : self.controlnet.config.conditioning_channels].to(self.dtype)
             down, middle = self.controlnet(
-                noisy, timesteps, encoder_hidden_states=text, controlnet_cond=guide, return_dict=False
-            )
+                noisy, timesteps, encoder_hidden_states=text if control_text is None else control_text,
+                controlnet_cond=guide, conditioning_scale=control_scale, guess_mode=guess, return_dict=False,
+            )  # fmt: skip
             residuals = {"down_block_additional_residuals": down, "mid_block_additional_residual": middle}
         return self.unet(torch.cat([noisy, condition], 1), timesteps, encoder_hidden_states=text, **residuals).sample
 
