@@ -27,9 +27,9 @@ def where_known(
     image: Tensor,  # [h, w, 3]
     unknown: Tensor,  # [h, w, 1]
 ) -> tuple[Tensor, Tensor]:
-    """Rendering and image [h, w, 3]. Where `unknown` is 1 both are the rendering itself, without gradient: a window
-    that reaches there compares the avatar with itself."""
-    own = rgb.detach()
+    """Rendering and image [h, w, 3]. Where `unknown` is 1 both are the rendering itself, without gradient and within
+    0 to 1 as an image is: a window that reaches there compares the avatar with itself."""
+    own = rgb.detach().clamp(0, 1)
     return torch.where(unknown > 0, own, rgb), torch.where(unknown > 0, own, image)
 
 
