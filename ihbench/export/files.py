@@ -107,18 +107,18 @@ class Exporter:
         from ihbench.export.skinned_glb import skinned_glb, standing
 
         subject, made = self.subject, self.baked()
-        pose = subject.pose(named)
+        pose, relief = subject.pose(named), made.relief if self.relief else None
         still = Motion(pose.pose[None], pose.transl[None], 1.0)
-        moving = {name: standing(motion, subject.body, subject.betas) for name, motion in clips}
+        moving = {name: standing(motion, subject.body, subject.betas, relief) for name, motion in clips}
         extras = self._extras(holds_body=True, pose=named, texture=made.how, pose_blend_shapes=False)
         return skinned_glb(
             self._glb(holds_body=True),
             subject.body,
             subject.betas,
-            standing(still, subject.body, subject.betas),
+            standing(still, subject.body, subject.betas, relief),
             moving,
             made.texture,
-            made.relief if self.relief else None,
+            relief,
             extras,
         )
 

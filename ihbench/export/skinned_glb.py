@@ -59,12 +59,12 @@ def four_weights(
     return np.where(kept > 0, order, 0).astype(np.uint8), kept
 
 
-def standing(motion: Motion, body: Body, betas: Array) -> Motion:
+def standing(motion: Motion, body: Body, betas: Array, relief: Array | None = None) -> Motion:
     """A motion of any world in glTF's: y up, the first frame facing +z with its pelvis over the origin; the lowest
-    point of all frames on the floor."""
+    point of all frames on the floor. `relief` [V, 3] m lies on the shaped T-pose."""
     moved = placed(motion, body, betas, Stand(np.eye(3), np.zeros(3)))
     some = moved.body_poses(betas)[:: max(1, len(moved) // 100)]
-    floor = min(body.pose(p, blend_shapes=False)[:, 1].min() for p in some)
+    floor = min(body.pose(p, blend_shapes=False, offsets=relief)[:, 1].min() for p in some)
     return Motion(moved.pose, moved.transl - (0, floor, 0), moved.fps, moved.cyclic)
 
 

@@ -74,7 +74,7 @@ def _from_pictures(
     cameras = list(_cameras(body, body_pose))
     with progress.task("baking", len(cameras)) as task:
         for camera in cameras:
-            color, alpha = drawn(avatar, camera, body_pose, BLACK, None, body, pixel)
+            color, alpha = drawn(avatar, camera, body_pose, BLACK, None, body, pixel, sharp=False)
             faced = PosedSurface(body, camera, body_pose).faced(texels)
             shown = alpha[faced.pixel]
             counts = faced.cosine**STRAIGHT * (shown > SOLID)

@@ -74,7 +74,9 @@ def splat_ply(
     table[:, 9:opacity] = harmonics[:, 1:].transpose(0, 2, 1).reshape(n, rest)
     share = np.clip(np.asarray(opacities, np.float64), TRANSPARENT, OPACITY)
     table[:, opacity] = np.log(share / (1 - share))
-    table[:, opacity + 1 : opacity + 4] = np.log(np.maximum(np.reshape(scales, (n, -1)), 1e-9))
+    table[:, opacity + 1 : opacity + 4] = np.log(
+        np.maximum(scales if np.ndim(scales) == 2 else np.asarray(scales)[:, None], 1e-9)
+    )
     table[:, opacity + 4 :] = rotation
     header = ["ply", "format binary_little_endian 1.0"]
     for line in comments:  # readers look for the end of the header as text

@@ -50,6 +50,7 @@ def drawn(
     frame: int | None,
     body: Body,
     pixel: float | None,  # m, the finest that is drawn; None for any
+    sharp: bool = True,  # enlarged by cubics, without their overshoots; False: linearly, for arithmetic with alpha
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """rgb [H, W, 3] and alpha [H, W] as `Avatar.render` gives them."""
     share = 1.0 if pixel is None else pixel_at(camera, body_pose, body) / pixel
@@ -58,10 +59,17 @@ def drawn(
         return rgb, alpha
     import cv2
 
-    size = tuple(max(8, round(n * share)) for n in (camera.width, camera.height))
-    rgb, alpha = avatar.render(camera.scaled(*size), body_pose, background, frame)
-    larger = [
-        cv2.resize(np.asarray(image, np.float32), (camera.width, camera.height), interpolation=cv2.INTER_CUBIC)
-        for image in (rgb, alpha)
-    ]
-    return np.clip(larger[0], 0, 1), np.clip(larger[1], 0, 1)
+    small = tuple(max(8, round(n * share)) for n in (camera.width, camera.height))
+    both = (np.asarray(v, np.float32) for v in avatar.render(camera.scaled(*small), body_pose, background, frame))
+    size, square = (camera.width, camera.height), np.ones((3, 3), np.uint8)
+    rgb, alpha = (
+        np.clip(
+            cv2.resize(image, size, interpolation=cv2.INTER_CUBIC),
+            cv2.resize(cv2.erode(image, square), size, interpolation=cv2.INTER_LINEAR),
+            cv2.resize(cv2.dilate(image, square), size, interpolation=cv2.INTER_LINEAR),
+        )
+        if sharp
+        else cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)
+        for image in both
+    )
+    return rgb, alpha

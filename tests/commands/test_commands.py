@@ -8,18 +8,10 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import pytest
 
-from ihbench import registry
-from ihbench.body.canonical import canonical_pose
-from ihbench.body.pose import BodyPose
-from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.files.atomic import read_json, read_json_lines
-from ihbench.files.splat_ply import read_splat_ply
 from ihbench.metrics import Identity
-from ihbench.record.finished_run import FinishedRun
 from ihbench.record.results import read_result
-from ihbench.runner.run_loop import load_avatar
 from ihbench.scene.data_source import standin_root
 from tests.conftest import contents, tiny_protocol
 

@@ -25,7 +25,7 @@ def some_gaussians(n=60, degree=2, seed=0):
     quaternions = tensor(rng.normal(size=(n, 4)))
     scales = tensor(rng.uniform(0.02, 0.15, (n, 3)))
     return PosedGaussians(
-        tensor(rng.normal(0, 0.4, (n, 3)) + (1, 2, 3)),
+        tensor(rng.normal((1, 2, 3), 0.4, (n, 3))),
         skinned_covariance(scales, quaternions),
         tensor(rng.normal(0, 0.3, (n, (degree + 1) ** 2, 3))),
         None,

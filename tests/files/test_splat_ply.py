@@ -99,7 +99,7 @@ def test_turned_and_transparent_needles_with_harmonics():
     ("change", "word"),
     [
         (lambda m, s, c: (m.T, s, c), "means"),
-        (lambda m, s, c: (m, np.repeat(s[:, None], 3, 1), c), "scales"),
+        (lambda m, s, c: (m, np.repeat(s[:, None], 2, 1), c), "scales"),
         (lambda m, s, c: (m, s, c[:, :1]), "colors"),
         (lambda m, s, c: (m, np.log(s), c), "logarithms"),
         (lambda m, s, c: (m, s, c * 255), "divide 8-bit"),
