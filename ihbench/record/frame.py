@@ -35,7 +35,8 @@ def frame(runs: Path | str | Iterable[Path | str]) -> pandas.DataFrame:
 
     `identity` is the metric's with its region, `value` is in the metric's own unit (dB for PSNR), NaN where it is
     absent, and `absent` then says why; `digest` names the run. What cannot be read is left out: its lines stand in
-    `.attrs["left_out"]`. Raises `BadInput` where there is no such folder, or none of those named can be read.
+    `.attrs["left_out"]`. A notebook shows the means first. Raises `BadInput` where there is no such folder, or none of
+    those named can be read.
     """
     if isinstance(runs, str | os.PathLike):
         folder = user_path(runs)
@@ -49,10 +50,10 @@ def frame(runs: Path | str | Iterable[Path | str]) -> pandas.DataFrame:
 
 def frame_of(results: Sequence[RunResult], left_out: Sequence[str] = ()) -> pandas.DataFrame:
     """As `frame`, of runs that are read."""
-    import pandas
+    from ihbench.record.notebook import RunFrame
 
     lines = chain.from_iterable(_lines(run) for run in results if run.status == "done")
-    table = pandas.DataFrame.from_records(list(lines), columns=list(COLUMNS))
+    table = RunFrame.from_records(list(lines), columns=list(COLUMNS))
     table.attrs["left_out"] = list(left_out)
     return table
 

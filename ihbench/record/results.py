@@ -56,6 +56,12 @@ class RunResult:
     def reason(self) -> str:
         return self.record.outcome.reason
 
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the headline and the contact sheet."""
+        from ihbench.record.notebook import run_html
+
+        return run_html(self)
+
     @property
     def outcome(self) -> str:
         """The status, and why where it is not done, with the path of the traceback where there is one."""

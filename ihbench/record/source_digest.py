@@ -36,7 +36,7 @@ NOT_IN_NUMBERS = (
     "commands/*", "kernels/*", "stress/*", "show/*", "export/*",
     "__main__.py", "cli.py", "clock/progress.py", "errors.py", "registry.py",
     "runner/ablation.py", "runner/executor.py", "record/index.py", "record/quality_time.py",
-    "record/frame.py", "record/scene_means.py", "record/row_choice.py", "record/row_labels.py",
+    "record/frame.py", "record/notebook.py", "record/scene_means.py", "record/row_choice.py", "record/row_labels.py",
     "scoring/contact_sheet.py", "document/*", "files/splat_ply.py",
     "api.py", "runner/repeat.py", "clock/gpu_slots.py", "clock/failures.py", "clock/streams.py",
     "clock/machine.py", "record/provenance.py", "clock/threads.py",
