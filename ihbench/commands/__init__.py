@@ -15,7 +15,7 @@ COMMANDS = {
     "metrics": "check every metric against oracles, other libraries and stored values",
     "weights": "learned weights the bench may not ship: list, where, fetch",
     "render": "an avatar turned around, moved, beside others: WebP, GIF, WebM, MP4 or PNG frames",
-    "export": "an avatar's Gaussians as a splat PLY",
+    "export": "an avatar for other programs: splat PLY, glTF with skin or splats, texture, motion",
     "stress": "stiff and extreme cases with known answers, case by case",
     "kernels": "error against milliseconds for the bench's own kernels",
     "train-mini": "train the small diffusion backbone on procedural people; goes on where it stopped",
