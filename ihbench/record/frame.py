@@ -35,8 +35,8 @@ def frame(runs: Path | str | Iterable[Path | str]) -> pandas.DataFrame:
 
     `identity` is the metric's with its region, `value` is in the metric's own unit (dB for PSNR), NaN where it is
     absent, and `absent` then says why; `digest` names the run. What cannot be read is left out: its lines stand in
-    `.attrs["left_out"]`. A notebook shows the means first. Raises `BadInput` where there is no such folder, or none of
-    those named can be read.
+    `.attrs["left_out"]`. A notebook shows the means first. Raises `BadInput` where there is no such folder, or
+    none of those named can be read.
     """
     if isinstance(runs, str | os.PathLike):
         folder = user_path(runs)

@@ -11,11 +11,13 @@ from ihbench.body.pose import BodyPose
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput
+from ihbench.export.splat_cloud import splat_cloud
 from ihbench.fit.big_pose.deformation import Deformation, inverse
 from ihbench.fit.gaussians.density import divergence_to_nearest
 from ihbench.fit.gaussians.gaussian_set import Gaussians
 from ihbench.fit.gaussians.skinned_covariance import skinned_covariance
 from ihbench.methods.gauhuman.config import OCCGAUHUMAN_PROFILES, PAPER, PROFILES
+from ihbench.render.splat import render_gaussians
 from tests.bench.fake_capture import a_camera, a_pose, the_body
 
 from .tiny_fit import random_pose
@@ -224,3 +226,24 @@ def test_the_profiles_keep_the_released_schedule():
 
 def changes_of(config):
     return [step for step in range(1, config.steps + 1) if config.density.changes_at(step)]
+
+
+def test_what_is_exported_of_it_is_what_it_draws():
+    """As files keep them: scales and quaternions of skinned covariances, harmonics, opacities."""
+    avatar, camera, pose = an_avatar(), a_camera(size=48), a_pose(0.4)
+    cloud, broken = splat_cloud(avatar.posed_gaussians(pose))
+    assert (len(cloud), broken, cloud.degree) == (len(avatar), 0, avatar.degree)
+    drawn = render_gaussians(
+        *(
+            torch.from_numpy(np.ascontiguousarray(v, np.float32))
+            for v in (cloud.means, cloud.scales, cloud.harmonics)
+        ),
+        camera,
+        quaternions=torch.from_numpy(np.float32(cloud.quaternions)),
+        opacities=torch.from_numpy(np.float32(cloud.opacities)),
+        sh_degree=cloud.degree,
+        preset="3dgs",
+    )[0]
+    shown = avatar.render(camera, pose)[0]
+    assert shown.std() > 0.02
+    np.testing.assert_allclose(drawn.clamp(0, 1), shown, atol=2e-3)
