@@ -70,19 +70,24 @@ class PictureSheet:
                 content[f".{kind}"] = memory.getvalue()
         return content
 
+    def _measured(self, side: float) -> tuple[float, list[float], list[float], list[_Head]]:
+        """in: the columns' width beside row heads of `side`; of each row its scale, its height and its head."""
+        widest = max((p.image.shape[1] for _, panels in self.rows for p in panels if p is not None), default=1)
+        across = len(self.columns)
+        width = min((WIDTH - side - GAP * (across - 1)) / across, max(widest * PIXEL, 0.6))
+        scales = [_scale(panels, width) for _, panels in self.rows]
+        heights = [scale * _tallest(panels) for scale, (_, panels) in zip(scales, self.rows, strict=True)]
+        heads = [_Head.fitting(head, height) for (head, _), height in zip(self.rows, heights, strict=True)]
+        return width, scales, heights, heads
+
     def _drawn(self) -> Figure:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
         across = len(self.columns)
-        shown = [panel for _, panels in self.rows for panel in panels if panel is not None]
-        widest = max((panel.image.shape[1] for panel in shown), default=1)
-        side = 2 * LINE  # the rows' heads, turned; long ones take more lines
-        for _ in range(2):
-            width = min((WIDTH - side - GAP * (across - 1)) / across, max(widest * PIXEL, 0.6))
-            heights = [width * _aspect(panels) for _, panels in self.rows]
-            heads = [_Head.fitting(head, height) for (head, _), height in zip(self.rows, heights, strict=True)]
-            side = max(head.height for head in heads)
+        *_, heads = self._measured(2 * LINE)  # the rows' heads, turned; long ones take more lines
+        side = max(head.height for head in heads)
+        width, scales, heights, heads = self._measured(side)
         tops = [_Head.fitting(head, width) for head in self.columns]
         top = max(head.height for head in tops)
         noted = [NOTE if any(p is not None and p.note for p in panels) else 0.0 for _, panels in self.rows]
@@ -99,15 +104,16 @@ class PictureSheet:
             x = side + c * (width + GAP) + width / 2
             drawn.text(*place(x, top / 2), head.text, fontsize=head.size, **middle)
         y = top
-        for (_, panels), head, height, note in zip(self.rows, heads, heights, noted, strict=True):
+        for (_, panels), head, scale, height, note in zip(self.rows, heads, scales, heights, noted, strict=True):
             at = place(side / 2, y + height / 2)
             drawn.text(*at, head.text, rotation=90, fontsize=head.size, **middle)
             for c, panel in enumerate(panels):
                 if panel is None:
                     continue
                 x = side + c * (width + GAP)
-                left, bottom = place(x, y + height)
-                axes = drawn.add_axes((left, bottom, width / total_width, height / total_height))
+                high, wide = (scale * n for n in panel.image.shape[:2])
+                left, bottom = place(x + (width - wide) / 2, y + (height + high) / 2)
+                axes = drawn.add_axes((left, bottom, wide / total_width, high / total_height))
                 axes.imshow(panel.image, interpolation="none", aspect="equal")  # a PDF keeps the pixels as they are
                 axes.axis("off")
                 if panel.note:
@@ -117,9 +123,15 @@ class PictureSheet:
         return drawn
 
 
-def _aspect(panels: Sequence[Panel | None]) -> float:
-    """Height over width of a row's places: that of its tallest panel, within bounds."""
-    return min(max((p.image.shape[0] / p.image.shape[1] for p in panels if p is not None), default=1.0), TALLEST)
+def _tallest(panels: Sequence[Panel | None]) -> int:
+    """px; of a row without a panel 1."""
+    return max((panel.image.shape[0] for panel in panels if panel is not None), default=1)
+
+
+def _scale(panels: Sequence[Panel | None], width: float) -> float:
+    """in a pixel of a row, one for all its panels: sizes in a row compare."""
+    widest = max((panel.image.shape[1] for panel in panels if panel is not None), default=1)
+    return min(width / widest, TALLEST * width / _tallest(panels))
 
 
 @dataclass(frozen=True)

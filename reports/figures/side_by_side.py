@@ -36,7 +36,7 @@ def visual(runs: Sequence[FinishedRun], views: int) -> PictureSheet:
 
     Raises `BadInput` for runs that may not stand in one table, and for pictures that are missing.
     """
-    table = _Table(runs)
+    table = Table(runs)
     rows: list[tuple[str, list[Panel | None]]] = []
     for scene in table.scenes:
         for loaded in scene.spread(views):
@@ -57,7 +57,7 @@ def ablation(runs: Sequence[FinishedRun], views: int) -> PictureSheet:
 
     Raises `BadInput` as `visual`, and for runs of several methods.
     """
-    table = _Table(runs)
+    table = Table(runs)
     methods = {run.method for run in table.results}
     if len(methods) > 1:
         raise BadInput(f"runs of the methods {', '.join(sorted(methods))}; an ablation compares variants of one")
@@ -75,6 +75,12 @@ def ablation(runs: Sequence[FinishedRun], views: int) -> PictureSheet:
     caption = f"Variants of {methods.pop()} on {table.people} under {table.conditions}. {table.note}"
     own = [_without(label, table.results[0].method) for label in table.labels]
     return PictureSheet((TRUTH, *own), rows, caption)
+
+
+def occluded_views(scene: OccludedScene) -> list[TrainView]:
+    """The training views in which something is hidden; all of them where nothing is."""
+    views = list(scene.train)
+    return [view for view in views if (view.mask == MaskState.UNKNOWN).any()] or views
 
 
 def _without(label: str, method: str) -> str:
@@ -106,9 +112,7 @@ class _Scene:
 
     @cached_property
     def occluded(self) -> list[TrainView]:
-        """The training views in which something is hidden; all of them where nothing is."""
-        views = list(self.made_on.train)
-        return [view for view in views if (view.mask == MaskState.UNKNOWN).any()] or views
+        return occluded_views(self.made_on)
 
     def training_input(self, loaded: LoadedView) -> NDArray[np.uint8]:
         """The training view that shows the person most nearly from the same side, cut to the person."""
@@ -160,7 +164,7 @@ def _side(view: TrainView | TestView) -> NDArray[np.float64]:
     return view.camera.R @ axis_angle_to_matrix(view.body_pose.pose[0])
 
 
-class _Table:
+class Table:
     """Runs that may stand beside each other: the first seed of each row and person."""
 
     def __init__(self, runs: Sequence[FinishedRun]):
@@ -200,9 +204,11 @@ class _Table:
         return f"{first.identity.protocol}, {first.identity.profile} profile ({data})"
 
     @property
-    def note(self) -> str:
+    def shown_seeds(self) -> str:
         shown = ", ".join(map(str, sorted(self.shown)))
-        region = self.results[0].headline
         more = f" of seeds {', '.join(map(str, self.seeds))}" if len(self.seeds) > 1 else ""
-        plural = "s" if len(self.shown) > 1 else ""
-        return f"Seed{plural} {shown}{more}. Numbers: PSNR of the view in `{region}`, in dB."
+        return f"Seed{'s' if len(self.shown) > 1 else ''} {shown}{more}."
+
+    @property
+    def note(self) -> str:
+        return f"{self.shown_seeds} Numbers: PSNR of the view in `{self.results[0].headline}`, in dB."

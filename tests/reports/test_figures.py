@@ -26,8 +26,10 @@ from ihbench.methods.inpainthuman.studies.multi_scale_figure import (
 from ihbench.metrics.eight_bit import displayed
 from ihbench.record.finished_run import FinishedRun
 from ihbench.record.schema import score_lines
-from ihbench.reports.figures.side_by_side import ablation, visual
+from ihbench.reports.figures.side_by_side import ablation, occluded_views, visual
+from ihbench.reports.figures.teaser import teaser
 from ihbench.scene.sightings import FINE
+from ihbench.scoring.contact_sheet import OCCLUDER
 
 
 def plain(*size: int) -> np.ndarray:
@@ -136,6 +138,21 @@ def test_multi_scale_marks_hidden_and_never_seen_surface(bench, finished):
         drawn = (panels[-1].image == np.array(colour)).all(-1)
         assert bool(drawn.any()) == bool(where.any())
         assert drawn.sum() <= where.sum() * per_texel
+
+
+def test_a_teaser_has_inputs_sides_and_poses_for_any_method(bench, mannequin):
+    assert bench.run(method=mannequin).status == 0
+    with bench.in_its_world():
+        run = FinishedRun(bench.folders()[0])
+        sheet = teaser([run], views=2)
+        occluded = occluded_views(run.scene)
+    assert sheet.columns == ("training input",) * 2 + ("front", "left", "back", "right", "march", "lunge")
+    ((head, panels),) = sheet.rows
+    assert head == "standin-1"
+    assert len(occluded) >= 2
+    assert all((panel.image == OCCLUDER).all(-1).any() for panel in panels[:2])
+    sides = [panel.image for panel in panels[2:]]
+    assert len({side.tobytes() for side in sides}) == len(sides), "every picture is another one"
 
 
 def test_each_levels_map_is_its_own(bench, finished):
