@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import io
 from base64 import b64encode
-from typing import TYPE_CHECKING
+from typing import Any
 
 import pandas
 
 from ihbench.document.document import Paragraph, Table, Words, emphasis, strong, write_fragment
 from ihbench.document.html import escape
 
-if TYPE_CHECKING:
-    from ihbench.record.results import RunResult
-
 SHEET_WIDTH = 900  # px at most of a contact sheet, which would make a notebook megabytes large
 LINES = 6  # of a long table
 NOT_SHOWN = ["digest", "folder", "identity", "protocol", "profile", "data"]  # of its columns: long, or said above
 
 
-def run_html(run: RunResult) -> str:
-    """The headline of one run beside its calibration rows, what it cost, and its contact sheet."""
+def run_html(run: Any) -> str:
+    """The headline of one `record.results.RunResult` beside its calibration rows, what it cost, its contact sheet."""
     who = run.identity
     words: list[Words] = [strong(run.method), f" on {run.scene}, seed {run.seed}, {who.protocol}, {who.profile}"]
     if run.about.standin:
@@ -47,7 +44,7 @@ def _number(value: float | None) -> str:
     return "—" if value is None else f"{value:.3g}"
 
 
-def _sheet(run: RunResult) -> str:
+def _sheet(run: Any) -> str:
     """The contact sheet as an image, smaller where it is large; nothing where it cannot be read."""
     from PIL import Image
 

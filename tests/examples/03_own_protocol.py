@@ -19,6 +19,7 @@ for old, new in (
     ('unlisted = "strip-generic"', 'unlisted = "lower-half"'),
     ("frames = { start = 0, stop = 500, step = 5 }", "frames = { start = 0, stop = 500, step = 100 }"),
     ("[profile.quick]", "[profile.quick]\ntrain = { frames = { step = 100 } }"),
+    ("cameras = { step = 2 }, frames = { step = 120 }", "cameras = { step = 8 }, frames = { step = 480 }"),
 ):
     assert old in text, old
     text = text.replace(old, new, 1)

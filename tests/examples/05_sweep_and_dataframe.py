@@ -13,7 +13,7 @@ PROTOCOL = sys.argv[1] if len(sys.argv) > 1 else "zju_occ"
 TINY = {"texels": 32, "levels": (16,), "decoder_width": 32, "position_map": 16, "inpaint.on": False}
 
 if __name__ == "__main__":
-    runs = [ihbench.run(PROTOCOL, "standin-1", steps=steps, image_size=64, **TINY) for steps in (4, 16)]
+    runs = [ihbench.run(PROTOCOL, "standin-1", steps=steps, image_size=64, **TINY) for steps in (4, 64)]
     for run in runs:
         print(f"{run.switches['steps']} steps: {run.status} in {run.fit_seconds:.1f} s, {run.folder}")
 

@@ -234,6 +234,7 @@ def _good_words(option: Option, world: World) -> list[str]:
         ("report", "table2"): runs,
         ("report", "lint"): [world.path("file.txt")],
         ("export",): [run],
+        ("render",): [run, "--orbit", "2", "--size", "16"],
         ("ceiling",): [run],
         ("train-mini",): ["--out", world.path("home") / "mini"],
         ("protocol", "show"): ["zju_occ"],
