@@ -13,7 +13,7 @@ from ihbench.document.html import escape
 
 SHEET_WIDTH = 900  # px at most of a contact sheet, which would make a notebook megabytes large
 LINES = 6  # of a long table
-NOT_SHOWN = ["digest", "folder", "identity", "protocol", "profile", "data"]  # of its columns: long, or said above
+NOT_SHOWN = ["digest", "folder", "identity", "protocol", "profile", "data", "absent"]  # long, or said above
 
 
 def run_html(run: Any) -> str:
@@ -86,7 +86,10 @@ def means_of(table: pandas.DataFrame) -> pandas.DataFrame:
     The same in several variants of a metric stands under the name of its identity."""
     named = table.assign(metric=_told_apart(table))
     by_run = named.groupby(["row", "metric", "region", "digest"], sort=False)["value"].mean()
-    return by_run.groupby(level=["row", "metric", "region"], sort=False).mean().unstack(["metric", "region"])  # type: ignore[return-value]
+    means = by_run.groupby(level=["row", "metric", "region"], sort=False).mean().unstack(["metric", "region"])
+    by_metric = [(m, r) for m in dict.fromkeys(named["metric"]) for r in dict.fromkeys(named["region"])]
+    known = [column for column in by_metric if column in means.columns]
+    return means[known].dropna(axis="columns", how="all")  # type: ignore[return-value]
 
 
 def _told_apart(table: pandas.DataFrame) -> pandas.Series:

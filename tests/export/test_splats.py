@@ -35,10 +35,10 @@ def some_gaussians(n=60, degree=2, seed=0):
 
 
 def drawn(means, scales, harmonics, opacities, camera, degree, quaternions=None):
-    values = [torch.from_numpy(np.array(v)) for v in (means, scales, harmonics)]
-    turns = None if quaternions is None else torch.from_numpy(np.array(quaternions))
+    values = [torch.as_tensor(v) for v in (means, scales, harmonics)]
+    turns = None if quaternions is None else torch.as_tensor(quaternions)
     return render_gaussians(
-        *values, camera, backend="reference", quaternions=turns, opacities=torch.from_numpy(np.array(opacities)),
+        *values, camera, backend="reference", quaternions=turns, opacities=torch.as_tensor(opacities),
         sh_degree=degree, preset="3dgs",
     )[0].numpy()  # fmt: skip
 
