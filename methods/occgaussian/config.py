@@ -157,8 +157,9 @@ SMOKE = replace(
     fewer(ON_A_CPU, 60, 10.0),
     lr_position=8e-4,
     lr_scale=2e-2,
-    features=FeatureConfig(channels=(8, 16, 16), size=16, erode=0, every=20, lr=3e-3, lr_last=1e-3),
+    features=FeatureConfig(channels=(8, 16, 16), size=16, erode=0, every=20, lr=1e-2, lr_last=2e-3),
     decoder=DecoderConfig(depth=2, width=32),
+    band=BandConfig(),
 )
 PROFILES = {"smoke": SMOKE, "quick": QUICK, "paper": PAPER}
 
