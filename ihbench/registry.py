@@ -29,12 +29,14 @@ GROUPS = {
     "report verb": "ihbench.report_verbs",
     "figure": "ihbench.figures",
     "paper figure": "ihbench.paper_figures",
+    "site": "ihbench.sites",
     "metric preset": "ihbench.presets",
 }
 
 ROOMS = ("methods", "datasets", "protocols", "reports")  # of the bench: content, found by name
 NEEDS = {  # attributes of what is registered
     "report verb": ("main",),
+    "site": ("build", "write_folder", "write_single"),
     "dataset": ("check",),
     "stand-in": ("version", "protocol", "subjects", "ensure", "n_frames", "n_cameras"),
     "metric preset": ("about", "source", "measures"),

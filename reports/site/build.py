@@ -1,0 +1,87 @@
+"""`ihbench site`: from finished runs to one offline page, in a folder or as a single file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ihbench.clock.progress import Progress
+from ihbench.errors import BadInput
+from ihbench.record import outputs
+from ihbench.record.results import RunResult
+from ihbench.reports.site.frames import Files, OpenScenes, scene_frames
+from ihbench.reports.site.page import page
+from ihbench.reports.site.tables import site_tables
+from ihbench.version import __version__
+
+LARGEST_FILE = 25 * 2**20  # bytes of a single file: browsers open 32 MB by double click, and mail takes 25
+FEWEST_VIEWS = 2
+TITLE = "ihbench: occluded people, rebuilt"
+
+
+@dataclass(frozen=True)
+class Site:
+    """A site before it is written."""
+
+    title: str
+    data: Mapping[str, Any]
+    files: Mapping[str, bytes] = field(default_factory=dict)  # pictures by name
+    carried: Mapping[str, bytes] = field(default_factory=dict)  # what a page must have inside: it may not read files
+
+    def html(self, single: bool = False, live: bool = False) -> str:
+        inside = {**self.carried, **(self.files if single else {})}
+        return page(self.title, self.data, inside, live)
+
+
+def build(
+    results: Sequence[RunResult],
+    left_out: Sequence[str] = (),
+    *,
+    views: int = 12,
+    title: str = TITLE,
+    data: Path | None = None,
+    body: Path | None = None,
+    progress: Progress | None = None,
+) -> Site:
+    """The site of these runs, with pictures of about `views` test views of a scene.
+
+    `data` and `body` are the user's copies, where runs used any; without them there are no truths beside the
+    predictions. Raises `BadInput` where there is no run.
+    """
+    if not results:
+        raise BadInput("there is no run to show")
+    progress = progress or Progress()
+    files, scenes = Files(), OpenScenes(data, body)
+    content = site_tables(results, left_out)
+    content["frames"] = [f.as_json for f in scene_frames(results, files, scenes, views, progress)]
+    content["made"] = f"Made by ihbench {__version__} from {len(results)} run{'s' * (len(results) != 1)}."
+    content["notes"] = []
+    return Site(title, content, files.content)
+
+
+def write_folder(site: Site, folder: Path) -> Path:
+    """`index.html` and the pictures beside it. Returns the page's path. Raises `BadInput` where somebody else's file
+    of such a name is there."""
+    outputs.check(folder, ["index.html"])
+    for name, content in site.files.items():
+        outputs.write_bytes(folder / "files" / name, content, durable=False)
+    index = folder / "index.html"
+    outputs.write_text(index, site.html())
+    return index
+
+
+def write_single(site: Site, file: Path) -> int:
+    """Everything in one file. Returns its size. Raises `BadInput` where it would be too large to open by double
+    click."""
+    text = site.html(single=True).encode("utf-8")
+    if len(text) > LARGEST_FILE:
+        raise BadInput(
+            f"{file}: would have {len(text) / 2**20:.0f} MB, more than {LARGEST_FILE / 2**20:.0f}; take fewer --views, "
+            "or leave --single-file out"
+        )
+    from ihbench.files import atomic
+
+    atomic.write_bytes(file, text)
+    return len(text)

@@ -1,0 +1,303 @@
+"""What a site says in numbers and words, as plain JSON: groups of runs that may stand in one table, their rows, the
+runs themselves with every score of every test view, curves, stages, and how to repeat them."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ihbench.clock.ledger import in_order
+from ihbench.config_fields import as_json
+from ihbench.document.marks import marks_by_interval
+from ihbench.errors import BadInput
+from ihbench.metrics import Identity, macro_mean
+from ihbench.metrics.identity import metric_of
+from ihbench.metrics.statistics import mean_interval
+from ihbench.record.results import RunResult, by_group
+from ihbench.record.row_labels import by_label
+from ihbench.record.scene_means import per_scene, scene_means
+from ihbench.record.schema import ScoreLine, score_lines
+from ihbench.reports.general.clock import machine_name, one_clock
+from ihbench.reports.general.significance import LEVEL, further_rows
+from ihbench.scene.method_spec import usable_specs
+from ihbench.scene.plan import Omission
+from ihbench.scoring.calibration import DESCRIPTIONS, ROWS
+
+Json = dict[str, Any]
+MOST_CURVE_POINTS = 400  # of one run; a page need not draw more
+
+
+def site_tables(results: Sequence[RunResult], left_out: Sequence[str] = ()) -> Json:
+    """All groups and runs. Runs are named by their place in `results`. Numbers are whole floats; what is not finite
+    is "inf" or "-inf", an absent number [k], k the number of its reason in the run's `reasons`."""
+    numbers = {id(run): k for k, run in enumerate(results)}
+    labels: dict[int, str] = {}
+    groups = []
+    for runs in by_group(results).values():
+        done = [run for run in runs if run.status == "done"]
+        for label, row in by_label(done).items():
+            labels |= {numbers[id(run)]: label for run in row}
+        groups.append(_group(runs, done, numbers))
+    of_group = {number: g for g, group in enumerate(groups) for number in group["runs"]}
+    return {
+        "groups": groups,
+        "runs": [
+            _run(run, of_group[k], labels.get(k, run.about.label or run.method)) for k, run in enumerate(results)
+        ],
+        "metrics": {name: _metric(name) for name in dict.fromkeys(i.metric for run in results for i in run.own)},
+        "left_out": list(left_out),
+        "citations": _citations(dict.fromkeys(run.method for run in results)),
+    }
+
+
+def number(value: float) -> float | str | None:
+    """A number as JSON has it; None for NaN."""
+    if math.isnan(value):
+        return None
+    return value if math.isfinite(value) else ("inf" if value > 0 else "-inf")
+
+
+def _metric(name: str) -> Json:
+    shown = metric_of(name)
+    return {
+        "title": shown.title, "arrow": shown.arrow, "unit": shown.unit, "scale": shown.scale,
+        "decimals": shown.decimals, "higher": shown.higher_is_better,
+    }  # fmt: skip
+
+
+def _group(runs: Sequence[RunResult], done: Sequence[RunResult], numbers: Mapping[int, int]) -> Json:
+    protocol, digest, profile, data = runs[0].group
+    identities = [
+        i
+        for i in dict.fromkeys(i for run in done for i in run.own)
+        if any(i in run.own and not run.own[i].absent for run in done)
+    ]
+    absent = {
+        str(i): run.own[i].reason for run in done for i in run.own if i not in identities and run.own[i].reason
+    }
+    return {
+        "protocol": protocol,
+        "digest": digest,
+        "profile": profile,
+        "data": data,
+        "standin": runs[0].about.standin or "",
+        "headline": next((run.headline for run in done), ""),
+        "identities": [{"name": str(i), "metric": i.metric, "region": i.region} for i in identities],
+        "absent": absent,
+        "rows": _rows(done, identities, numbers),
+        "runs": [numbers[id(run)] for run in runs],
+        "toml": toml(runs[0].about.protocol or {}),
+    }
+
+
+def _rows(done: Sequence[RunResult], identities: Sequence[Identity], numbers: Mapping[int, int]) -> list[Json]:
+    """Methods' rows, with those of further groups of test views below them, then the calibration rows."""
+    labelled = by_label(done)
+    rows: list[Json] = []
+    marks = _marks(labelled, identities)
+    for label, runs in labelled.items():
+        for name in (runs[0].method, *further_rows(runs)):
+            own = name == runs[0].method
+            row = _row(label + name.removeprefix(runs[0].method), runs, identities, name, numbers)
+            rows.append(row | {"kind": "method" if own else "further", "marks": marks[label] if own else {}})
+    for name in ROWS:
+        if having := [run for run in done if name in run.rows]:
+            row = _row(name, having, identities, name, numbers)
+            rows.append(row | {"kind": "bound", "marks": {}, "about": DESCRIPTIONS[name], "fit": None, "total": None})
+    return rows
+
+
+def _row(
+    label: str, runs: Sequence[RunResult], identities: Sequence[Identity], name: str, numbers: Mapping[int, int]
+) -> Json:
+    means, intervals, scenes = {}, {}, {}
+    for i in identities:
+        found = scene_means(runs, i, name)
+        if not found:
+            continue
+        means[str(i)] = number(macro_mean(found).value)
+        scenes[str(i)] = {scene: number(mean.value) for scene, mean in found.items()}
+        finite = {scene: mean.value for scene, mean in found.items() if math.isfinite(mean.value)}
+        if len(finite) > 1:
+            interval = mean_interval(finite, LEVEL)
+            if math.isfinite(interval.low):
+                intervals[str(i)] = [interval.low, interval.high]
+    seconds = {
+        key: [value for run in runs if (value := getattr(run.about, f"{key}_seconds")) is not None]
+        for key in ("fit", "total")
+    }
+    alike = one_clock(runs)
+    return {
+        "label": label,
+        "method": runs[0].method,
+        "row": name,
+        "runs": [numbers[id(run)] for run in runs],
+        "scenes": sorted({run.scene for run in runs}),
+        "seeds": sorted({run.seed for run in runs}),
+        "means": means,
+        "by_scene": scenes,
+        "intervals": intervals,
+        **{key: sum(found) / len(found) if found and alike else None for key, found in seconds.items()},
+        "peak": max((run.about.peak_mb or 0.0 for run in runs), default=0.0),
+    }
+
+
+def _marks(labelled: Mapping[str, Sequence[RunResult]], identities: Sequence[Identity]) -> dict[str, Json]:
+    """Label -> identity -> best or second, where the intervals over scenes allow it."""
+    labels = list(labelled)
+    marks: dict[str, Json] = {label: {} for label in labels}
+    for i in identities:
+        found = [scene_means(runs, i) for runs in labelled.values()]
+        shown = [float(f"{macro_mean(means).value:.12g}") if means else math.nan for means in found]
+        rounded = [round(value * i.display.scale, i.display.decimals) for value in shown]
+        by_scene = [per_scene(runs, i) for runs in labelled.values()]
+        given = marks_by_interval(labels, rounded, by_scene, i.display.higher_is_better, LEVEL).marks
+        for label, mark in zip(labels, given, strict=True):
+            if mark:
+                marks[label][str(i)] = mark
+    return marks
+
+
+def _run(run: RunResult, group: int, label: str) -> Json:
+    record, about = run.record, run.about
+    identities = list(run.own)
+    reasons: dict[str, int] = {}
+    return {
+        "name": run.folder.name,
+        "group": group,
+        "label": label,
+        "method": run.method,
+        "scene": run.scene,
+        "seed": run.seed,
+        "status": run.status,
+        "reason": run.reason,
+        "standin": about.standin or "",
+        "headline": run.headline,
+        "identities": [str(i) for i in identities],
+        "means": [number(run.own[i].value) for i in identities],
+        "views": _views(run, identities, reasons),
+        "reasons": list(reasons),
+        "curve": _curve(run),
+        "stages": _stages(run),
+        "wall": record.ledger.seconds if record.ledger is not None else None,
+        "fit": about.fit_seconds,
+        "total": about.total_seconds,
+        "peak": about.peak_mb,
+        "hidden_share": about.hidden_share,
+        "left_out": [_omission(o) for o in about.left_out or ()],
+        "warnings": list(record.warnings),
+        "facts": _facts(run),
+        "repeat": f"ihbench run --like {run.folder.name}",
+        "command": " ".join(("ihbench", *about.command)) if about.command else "",
+        "config": as_json(run.identity.config),
+    }
+
+
+def _omission(omission: Omission) -> str:
+    return f"{omission.field} → {omission.value}: {omission.reason}"
+
+
+def _facts(run: RunResult) -> list[list[str]]:
+    """Name and value of what a reader should know of a run."""
+    record, identity, git = run.record, run.identity, run.record.provenance.git
+    facts = {
+        "run": record.digest,
+        "data": run.data,
+        "variant": run.about.variant or "",
+        "code": identity.code,
+        "body": f"{run.about.body or '?'} {identity.body}",
+        "made": f"{record.outcome.created} to {record.outcome.updated or '?'}",
+        "machine": machine_name(run),
+        "device": run.about.device,
+        "python": f"{record.machine.python}, torch {record.machine.torch}, {record.machine.platform}",
+        "ihbench": record.provenance.ihbench,
+        "commit": "" if git is None else f"{git.commit}{' and files that differ from it' if git.dirty else ''}",
+        "packages": ", ".join(f"{name} {version}" for name, version in record.provenance.packages.items()),
+    }
+    return [[name, str(value)] for name, value in facts.items() if value]
+
+
+def _views(run: RunResult, identities: Sequence[Identity], reasons: dict[str, int]) -> list[Json]:
+    """Every test view with its own scores, in the order of `identities`."""
+    try:
+        lines = score_lines(run.folder / "scores.jsonl")
+    except (BadInput, OSError):
+        return []
+    return [
+        {
+            "camera": str(line.camera),
+            "frame": line.frame,
+            "group": line.row.removeprefix(run.method).strip(" []"),
+            "scores": [_score(line, i, reasons) for i in identities],
+        }
+        for line in lines
+    ]
+
+
+def _score(line: ScoreLine, identity: Identity, reasons: dict[str, int]) -> Any:
+    value = float(line.scores.get(identity, math.nan))
+    if math.isnan(value):
+        reason = line.absent.get(str(identity), "no reason recorded")
+        return [reasons.setdefault(reason, len(reasons))]
+    return number(value)
+
+
+def _curve(run: RunResult) -> list[Json]:
+    return [
+        {
+            "step": point.step,
+            "seconds": point.seconds,
+            "views": point.views,
+            "of": point.of,
+            "scores": {str(i): number(float(v)) for i, v in point.scores.items() if not math.isnan(v)},
+        }
+        for point in run.curve[-MOST_CURVE_POINTS:]
+    ]
+
+
+def _stages(run: RunResult) -> list[list[Any]]:
+    """[path, seconds], parents before children."""
+    ledger = run.record.ledger
+    return [] if ledger is None else [[path, ledger.stages[path].seconds] for path in in_order(ledger.stages)]
+
+
+def _citations(methods: Sequence[str] | Mapping[str, None]) -> list[str]:
+    """BibTeX of the methods' papers that the bench knows, and how the bench itself is to be named."""
+    specs = {spec.name: spec for spec in usable_specs()}
+    entries = []
+    for name in methods:
+        paper = specs[name].paper if name in specs else None
+        if paper is not None:
+            parts = {"title": paper.title, "author": paper.authors, "year": str(paper.year or "")}
+            lines = [f"  {key} = {{{value}}}," for key, value in parts.items() if value]
+            key = re.sub(r"\W", "", name) + str(paper.year or "")
+            entries.append("\n".join((f"@article{{{key},", *lines, "}")))
+    return entries
+
+
+def toml(content: Mapping[str, Any], inside: str = "") -> str:
+    """A protocol's content as TOML, tables after the values of the table they are in."""
+    lines = [f"{_key(name)} = {_value(value)}" for name, value in content.items() if not isinstance(value, Mapping)]
+    for name, value in content.items():
+        if isinstance(value, Mapping):
+            path = f"{inside}{_key(name)}"
+            lines += ["", f"[{path}]", toml(value, f"{path}.").rstrip("\n")]
+    return "\n".join(lines).lstrip("\n") + "\n"
+
+
+def _key(name: str) -> str:
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _value(name)
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if value is None:
+        return '""'
+    if isinstance(value, str):
+        return '"' + value.translate({0x22: '\\"', 0x5C: "\\\\", 0x0A: "\\n"}) + '"'
+    if isinstance(value, Sequence):
+        return f"[{', '.join(map(_value, value))}]"
+    return str(value)
