@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -31,6 +31,8 @@ class SiteOptions:
     """About so many test views of a scene have pictures: spread over all, and the worst. All have their numbers."""
     title: str | None = None
     """Title of the page."""
+    share: bool = False
+    """For passing on: avatars on a licensed body, whose weights would be in the page, are shown in pictures alone."""
     data: Path | None = None
     """Your copy of the data set, for runs on real data; without it there is no truth beside the predictions."""
     body: Path | None = None
@@ -43,8 +45,9 @@ def main(argv: list[str]) -> int:
     results, left_out = read_runs(chosen.runs)
     say_left_out(left_out)
     general = registry.load("site", "general")
-    more = {} if chosen.title is None else {"title": chosen.title}
-    site = general.build(results, left_out, views=chosen.views, data=chosen.data, body=chosen.body, **more)
+    more: dict[str, Any] = {} if chosen.title is None else {"title": chosen.title}
+    more |= {"share": chosen.share, "data": chosen.data, "body": chosen.body}
+    site = general.build(results, left_out, views=chosen.views, **more)
     if chosen.single_file:
         file = chosen.out if chosen.out.suffix in (".html", ".htm") else chosen.out / "index.html"
         size = general.write_single(site, file)
@@ -75,5 +78,3 @@ def read_runs(places: tuple[Path, ...]) -> tuple[list[RunResult], list[str]]:
             "ihbench run --protocol zju_occ --scene standin-1"
         )
     return results, [*left_out, *copies]
-
-

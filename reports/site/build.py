@@ -12,6 +12,7 @@ from ihbench.errors import BadInput
 from ihbench.record import outputs
 from ihbench.record.results import RunResult
 from ihbench.reports.site.frames import Files, OpenScenes, scene_frames
+from ihbench.reports.site.moving import avatars
 from ihbench.reports.site.page import page
 from ihbench.reports.site.tables import site_tables
 from ihbench.version import __version__
@@ -43,22 +44,26 @@ def build(
     title: str = TITLE,
     data: Path | None = None,
     body: Path | None = None,
+    share: bool = False,
     progress: Progress | None = None,
 ) -> Site:
     """The site of these runs, with pictures of about `views` test views of a scene.
 
     `data` and `body` are the user's copies, where runs used any; without them there are no truths beside the
-    predictions. Raises `BadInput` where there is no run.
+    predictions. `share` leaves out what a body model's licence does not let pass on. Raises `BadInput`
+    where there is no run.
     """
     if not results:
         raise BadInput("there is no run to show")
     progress = progress or Progress()
     files, scenes = Files(), OpenScenes(data, body)
     content = site_tables(results, left_out)
-    content["frames"] = [f.as_json for f in scene_frames(results, files, scenes, views, progress)]
+    frames = scene_frames(results, files, scenes, views, progress)
+    moving, carried = avatars(results, frames, files, scenes, progress, share)
+    content |= {"frames": [f.as_json for f in frames], **moving}
     content["made"] = f"Made by ihbench {__version__} from {len(results)} run{'s' * (len(results) != 1)}."
     content["notes"] = []
-    return Site(title, content, files.content)
+    return Site(title, content, files.content, carried)
 
 
 def write_folder(site: Site, folder: Path) -> Path:
@@ -78,8 +83,8 @@ def write_single(site: Site, file: Path) -> int:
     text = site.html(single=True).encode("utf-8")
     if len(text) > LARGEST_FILE:
         raise BadInput(
-            f"{file}: would have {len(text) / 2**20:.0f} MB, more than {LARGEST_FILE / 2**20:.0f}; take fewer --views, "
-            "or leave --single-file out"
+            f"{file}: would have {len(text) / 2**20:.0f} MB, more than {LARGEST_FILE / 2**20:.0f}; take fewer "
+            "--views, or leave --single-file out"
         )
     from ihbench.files import atomic
 

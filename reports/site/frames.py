@@ -21,6 +21,7 @@ from ihbench.metrics.eight_bit import displayed
 from ihbench.metrics.images import bounds
 from ihbench.record.finished_run import FinishedRun
 from ihbench.record.results import RunResult, by_group, grouped
+from ihbench.record.schema import score_lines
 from ihbench.scene.mask_state import MaskState
 from ihbench.scene.spread import spread
 from ihbench.scoring.scoring import LoadedView, Scorer
@@ -144,20 +145,17 @@ def _rendered(runs: Any) -> list[tuple[str, int]]:
 def _worst(run: RunResult) -> list[tuple[str, int]]:
     """Camera and frame of the test view that is worst, in the first metric, of the headline region and of what was
     hidden."""
-    from ihbench.record.schema import score_lines
-
     try:
         lines = [line for line in score_lines(run.folder / "scores.jsonl") if line.row == run.method]
     except (BadInput, OSError):
         return []
     worst = []
     for region in (run.headline, "hidden"):
-        identity = next((i for i in run.own if i.region == region), None)
-        finite = [line for line in lines if identity in line.scores and math.isfinite(line.scores[identity])]
-        if identity is not None and finite:
-            sign = 1 if identity.display.higher_is_better else -1
-            line = min(finite, key=lambda line: sign * line.scores[identity])
-            worst.append((str(line.camera), line.frame))
+        for i in [i for i in run.own if i.region == region][:1]:
+            finite = [line for line in lines if i in line.scores and math.isfinite(line.scores[i])]
+            sign = 1 if i.display.higher_is_better else -1
+            for line in sorted(finite, key=lambda line: sign * line.scores[i])[:1]:  # noqa: B023 - used at once
+                worst.append((str(line.camera), line.frame))
     return worst
 
 
@@ -228,4 +226,9 @@ def _truth(loaded: LoadedView, scorer: Scorer, files: Files) -> dict[str, Any]:
         "input_frame": frames[nearest],
         "window": _grown(_person(displayed(view.image)), view.camera.width, view.camera.height),
         "masks": masks,
+        "K": view.camera.K.tolist(),
+        "R": view.camera.R.tolist(),
+        "t": view.camera.t.tolist(),
+        "pose": np.round(view.body_pose.pose.ravel(), 7).tolist(),
+        "transl": view.body_pose.transl.tolist(),
     }

@@ -74,9 +74,7 @@ def _group(runs: Sequence[RunResult], done: Sequence[RunResult], numbers: Mappin
         for i in dict.fromkeys(i for run in done for i in run.own)
         if any(i in run.own and not run.own[i].absent for run in done)
     ]
-    absent = {
-        str(i): run.own[i].reason for run in done for i in run.own if i not in identities and run.own[i].reason
-    }
+    absent = {str(i): run.own[i].reason for run in done for i in run.own if i not in identities and run.own[i].reason}
     return {
         "protocol": protocol,
         "digest": digest,

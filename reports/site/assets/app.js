@@ -55,6 +55,7 @@ function restoreFocus(path) {
 
 document.addEventListener("keydown", (event) => {
   if (event.altKey || event.ctrlKey || event.metaKey || /^(INPUT|SELECT|TEXTAREA)$/.test(event.target.tagName)) return;
+  if (event.key === " " && /^(BUTTON|A|SUMMARY)$/.test(event.target.tagName)) return; // presses it
   if (keys[event.key]) {
     event.preventDefault();
     keys[event.key]();

@@ -1,1 +1,283 @@
-// splats
+// A small WebGL2 renderer of skinned circles. It draws what the bench's own renderer draws (ihbench/render/splat.py):
+// variance (f s / z)² + LOW_PASS px², alpha min(ALPHA_MAX, exp(-d² / 2v)) down to one grey level, back to front.
+// Points are posed in the vertex shader, as a blend of 24 joints' transforms.
+
+const NEAR = 0.01, LOW_PASS = 0.3, ALPHA_MAX = 0.999, JOINTS = 24, ROW = 1024;
+
+const VERTEX = `#version 300 es
+precision highp float;
+precision highp int;
+precision highp sampler2D;
+precision highp usampler2D;
+uniform sampler2D places;    // x y z of the rest pose, and the scale, m
+uniform usampler2D skins;    // four joints, their four weights, colour and label; 8 bits each
+uniform vec4 joints[${3 * JOINTS}];
+uniform vec4 view[3];        // world to camera, row by row
+uniform vec4 lens;           // fx fy cx cy, px
+uniform float skew;
+uniform vec2 size;           // px
+uniform int tinted;          // bit k: label k is painted over; bit 8: surface that a painter made
+in uint number;
+out vec2 offset;
+flat out float variance;
+flat out vec3 colour;
+vec4 bytes(uint four) {
+  return vec4(four & 255u, (four >> 8) & 255u, (four >> 16) & 255u, four >> 24);
+}
+const vec3 TINTS[5] = vec3[5](vec3(.6), vec3(0., .620, .451), vec3(.835, .369, 0.), vec3(.8, .475, .655), vec3(.902, .624, 0.));
+void main() {
+  ivec2 at = ivec2(number % ${ROW}u, number / ${ROW}u);
+  vec4 place = texelFetch(places, at, 0);
+  uvec4 skin = texelFetch(skins, at, 0);
+  vec4 rest = vec4(place.xyz, 1.), weights = bytes(skin.y) / 255.;
+  uvec4 bones = uvec4(bytes(skin.x));
+  vec4 world = vec4(0., 0., 0., 1.);
+  for (int k = 0; k < 4; k++) {
+    int j = 3 * int(bones[k]);
+    world.xyz += weights[k] * vec3(dot(joints[j], rest), dot(joints[j + 1], rest), dot(joints[j + 2], rest));
+  }
+  vec3 p = vec3(dot(view[0], world), dot(view[1], world), dot(view[2], world));
+  vec4 look = bytes(skin.z);
+  int label = int(look.w);
+  colour = look.rgb / 255.;
+  int part = label & 3;
+  if ((label & 4) != 0 && (tinted & 256) != 0) part = 4;
+  else if ((tinted & (1 << part)) == 0) part = -1;
+  if (part >= 0) colour = mix(colour, TINTS[part], .62);
+  variance = place.w * place.w * lens.x * lens.y / (p.z * p.z) + ${LOW_PASS};
+  float reach = sqrt(2. * log(255.) * variance) + .5;
+  vec2 corner = vec2(float(gl_VertexID & 1), float(gl_VertexID >> 1)) * 2. - 1.;
+  offset = corner * reach;
+  vec2 pixel = vec2((lens.x * p.x + skew * p.y) / p.z + lens.z, lens.y * p.y / p.z + lens.w) + offset;
+  gl_Position = p.z > ${NEAR} ? vec4(2. * pixel.x / size.x - 1., 1. - 2. * pixel.y / size.y, 0., 1.) : vec4(2., 2., 2., 1.);
+}`;
+
+const FRAGMENT = `#version 300 es
+precision highp float;
+in vec2 offset;
+flat in float variance;
+flat in vec3 colour;
+out vec4 drawn;
+void main() {
+  float alpha = min(${ALPHA_MAX}, exp(-.5 * dot(offset, offset) / variance));
+  if (alpha < 1. / 255.) discard;
+  drawn = vec4(colour * alpha, alpha);
+}`;
+
+class Splats {
+  // Throws where there is no WebGL2. `lost` is called when the context goes away.
+  constructor(canvas, lost) {
+    this.canvas = canvas;
+    const gl = canvas.getContext("webgl2", { antialias: false, depth: false, preserveDrawingBuffer: true });
+    if (!gl) throw new Error("this browser has no WebGL2");
+    canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); lost("the graphics context was lost"); });
+    this.gl = gl;
+    const shader = (kind, text) => {
+      const one = gl.createShader(kind);
+      gl.shaderSource(one, text);
+      gl.compileShader(one);
+      if (!gl.getShaderParameter(one, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(one) ?? "no shader");
+      return one;
+    };
+    this.program = gl.createProgram();
+    gl.attachShader(this.program, shader(gl.VERTEX_SHADER, VERTEX));
+    gl.attachShader(this.program, shader(gl.FRAGMENT_SHADER, FRAGMENT));
+    gl.linkProgram(this.program);
+    if (!gl.getProgramParameter(this.program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(this.program) ?? "no program");
+    gl.useProgram(this.program);
+    this.at = Object.fromEntries(["places", "skins", "joints", "view", "lens", "skew", "size", "tinted"]
+      .map((name) => [name, gl.getUniformLocation(this.program, name)]));
+    gl.uniform1i(this.at.places, 0);
+    gl.uniform1i(this.at.skins, 1);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+  }
+
+  // `avatar`: count, rest [3n], scales [n], bones [4n], weights [4n], colours [3n], labels [n]
+  load(avatar) {
+    const { gl } = this;
+    this.avatar = avatar;
+    const rows = Math.ceil(avatar.count / ROW);
+    const places = new Float32Array(4 * ROW * rows);
+    const skins = new Uint32Array(4 * ROW * rows);
+    const four = (a, b, c, d) => (a | (b << 8) | (c << 16) | (d << 24)) >>> 0;
+    for (let i = 0; i < avatar.count; i++) {
+      for (let k = 0; k < 3; k++) places[4 * i + k] = avatar.rest[3 * i + k];
+      places[4 * i + 3] = avatar.scales[i];
+      skins[4 * i] = four(...avatar.bones.subarray(4 * i, 4 * i + 4));
+      skins[4 * i + 1] = four(...avatar.weights.subarray(4 * i, 4 * i + 4));
+      skins[4 * i + 2] = four(...avatar.colours.subarray(3 * i, 3 * i + 3), avatar.labels[i]);
+    }
+    const texture = (unit, inner, format, kind, data) => {
+      gl.activeTexture(gl.TEXTURE0 + unit);
+      gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
+      gl.texImage2D(gl.TEXTURE_2D, 0, inner, ROW, rows, 0, format, kind, data);
+      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+    };
+    texture(0, gl.RGBA32F, gl.RGBA, gl.FLOAT, places);
+    texture(1, gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT, skins);
+    this.order = new Uint32Array(avatar.count);
+    this.keys = new Uint16Array(avatar.count);
+    this.depths = new Float32Array(avatar.count);
+    gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+    const number = gl.getAttribLocation(this.program, "number");
+    gl.enableVertexAttribArray(number);
+    gl.vertexAttribIPointer(number, 1, gl.UNSIGNED_INT, 0, 0);
+    gl.vertexAttribDivisor(number, 1);
+  }
+
+  // joints [12 × 24], rows of the transforms from rest to world; camera: R [9], t [3], fx fy cx cy skew width height
+  draw(joints, camera, tinted = 0) {
+    const { gl, at, canvas } = this;
+    if (gl.isContextLost()) return;
+    if (canvas.width !== camera.width || canvas.height !== camera.height) {
+      canvas.width = camera.width;
+      canvas.height = camera.height;
+    }
+    gl.viewport(0, 0, camera.width, camera.height);
+    gl.uniform4fv(at.joints, joints);
+    const { R, t } = camera;
+    gl.uniform4fv(at.view, [R[0], R[1], R[2], t[0], R[3], R[4], R[5], t[1], R[6], R[7], R[8], t[2]]);
+    gl.uniform4f(at.lens, camera.fx, camera.fy, camera.cx, camera.cy);
+    gl.uniform1f(at.skew, camera.skew);
+    gl.uniform2f(at.size, camera.width, camera.height);
+    gl.uniform1i(at.tinted, tinted);
+    this.sort(joints, camera);
+    gl.bufferData(gl.ARRAY_BUFFER, this.order, gl.DYNAMIC_DRAW);
+    gl.clearColor(0, 0, 0, 0);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.avatar.count);
+  }
+
+  // From back to front, by counting 16-bit depths; equal ones by their numbers, the first in front.
+  sort(joints, { R, t }) {
+    const { count, rest, bones, weights } = this.avatar;
+    const row = new Float32Array(4 * JOINTS); // what a joint adds to a point's depth
+    for (let j = 0; j < JOINTS; j++) {
+      for (let c = 0; c < 4; c++) {
+        row[4 * j + c] = R[6] * joints[12 * j + c] + R[7] * joints[12 * j + 4 + c] + R[8] * joints[12 * j + 8 + c];
+      }
+    }
+    const { depths, keys, order } = this;
+    let low = Infinity, high = -Infinity;
+    for (let i = 0; i < count; i++) {
+      const x = rest[3 * i], y = rest[3 * i + 1], z = rest[3 * i + 2];
+      let depth = t[2];
+      for (let k = 4 * i; k < 4 * i + 4; k++) {
+        const w = weights[k];
+        if (w === 0) continue;
+        const j = 4 * bones[k];
+        depth += w / 255 * (row[j] * x + row[j + 1] * y + row[j + 2] * z + row[j + 3]);
+      }
+      depths[i] = depth;
+      if (depth < low) low = depth;
+      if (depth > high) high = depth;
+    }
+    const scale = 65535 / Math.max(high - low, 1e-6);
+    const starts = new Uint32Array(65537);
+    for (let i = 0; i < count; i++) {
+      keys[i] = 65535 - (depths[i] - low) * scale;
+      starts[keys[i] + 1]++;
+    }
+    for (let k = 0; k < 65536; k++) starts[k + 1] += starts[k];
+    for (let i = count - 1; i >= 0; i--) order[starts[keys[i]]++] = i;
+  }
+
+  // [4 × width × height] premultiplied RGBA as drawn, the top row first
+  pixels() {
+    const { gl, canvas } = this;
+    const out = new Uint8Array(4 * canvas.width * canvas.height);
+    gl.readPixels(0, 0, canvas.width, canvas.height, gl.RGBA, gl.UNSIGNED_BYTE, out);
+    const flipped = new Uint8Array(out.length);
+    const line = 4 * canvas.width;
+    for (let y = 0; y < canvas.height; y++) flipped.set(out.subarray(y * line, (y + 1) * line), (canvas.height - 1 - y) * line);
+    return flipped;
+  }
+
+  close() {
+    this.gl.getExtension("WEBGL_lose_context")?.loseContext();
+  }
+}
+
+// --- posing ---
+
+// [9] of an axis-angle vector, row by row
+function rotation(x, y, z) {
+  const angle = Math.hypot(x, y, z);
+  if (angle < 1e-9) return [1, -z, y, z, 1, -x, -y, x, 1];
+  const [u, v, w] = [x / angle, y / angle, z / angle];
+  const [c, s] = [Math.cos(angle), Math.sin(angle)];
+  const d = 1 - c;
+  return [c + u * u * d, u * v * d - w * s, u * w * d + v * s, u * v * d + w * s, c + v * v * d, v * w * d - u * s,
+    u * w * d - v * s, v * w * d + u * s, c + w * w * d];
+}
+
+function times(a, b) {
+  const out = new Array(9).fill(0);
+  for (let i = 0; i < 3; i++) for (let j = 0; j < 3; j++) for (let k = 0; k < 3; k++) out[3 * i + j] += a[3 * i + k] * b[3 * k + j];
+  return out;
+}
+
+function turned(m, p) {
+  return [0, 1, 2].map((i) => m[3 * i] * p[0] + m[3 * i + 1] * p[1] + m[3 * i + 2] * p[2]);
+}
+
+// [12 × 24] rows that take points at rest to the posed world: SMPL's kinematic chain. `rotations` [24][9], local.
+function chain(rotations, joints, parents, transl) {
+  const world = [];
+  const out = new Float32Array(12 * JOINTS);
+  for (let j = 0; j < JOINTS; j++) {
+    const parent = parents[j];
+    const R = parent < 0 ? rotations[j] : times(world[parent].R, rotations[j]);
+    const step = parent < 0 ? joints[j] : turned(world[parent].R, joints[j].map((v, k) => v - joints[parent][k]));
+    const t = parent < 0 ? step : step.map((v, k) => v + world[parent].t[k]);
+    world.push({ R, t });
+    const moved = turned(R, joints[j]);
+    for (let i = 0; i < 3; i++) {
+      out.set([R[3 * i], R[3 * i + 1], R[3 * i + 2], t[i] - moved[i] + transl[i]], 12 * j + 4 * i);
+    }
+  }
+  return out;
+}
+
+// --- unpacking what `ihbench.reports.site.avatars` has packed ---
+
+async function inflated(name) {
+  const text = fileText(name);
+  if (text === null) throw new Error(`${name} is not in this page`);
+  const stream = new Blob([bytesOf(text)]).stream().pipeThrough(new DecompressionStream("deflate-raw"));
+  return new Uint8Array(await new Response(stream).arrayBuffer());
+}
+
+async function unpacked(about) {
+  const [own, skin] = await Promise.all([inflated(about.own), inflated(about.skin)]);
+  const n = about.count;
+  const narrow = (data, at) => {
+    const out = new Uint8Array(n);
+    for (let i = 0, v = 0; i < n; i++) out[i] = v = (v + data[at + i]) & 255;
+    return out;
+  };
+  const wide = (data, at) => {
+    const out = new Uint16Array(n);
+    for (let i = 0, v = 0; i < n; i++) out[i] = v = (v + data[at + i] + 256 * data[at + n + i]) & 65535;
+    return out;
+  };
+  const together = (planes) => {
+    const out = new Uint8Array(planes.length * n);
+    planes.forEach((plane, k) => { for (let i = 0; i < n; i++) out[planes.length * i + k] = plane[i]; });
+    return out;
+  };
+  const rest = new Float32Array(3 * n);
+  for (let k = 0; k < 3; k++) {
+    const plane = wide(own, 2 * n * k);
+    for (let i = 0; i < n; i++) rest[3 * i + k] = about.low[k] + plane[i] / 65535 * about.size[k];
+  }
+  const [low, high] = about.scales.map(Math.log);
+  const scales = Float32Array.from(wide(own, 6 * n), (v) => Math.exp(low + v / 65535 * (high - low)));
+  return {
+    count: n, rest, scales, colours: together([0, 1, 2].map((k) => narrow(own, (8 + k) * n))), labels: narrow(own, 11 * n),
+    bones: together([0, 1, 2, 3].map((k) => narrow(skin, k * n))), weights: together([4, 5, 6, 7].map((k) => narrow(skin, k * n))),
+    joints: about.joints,
+  };
+}

@@ -1,0 +1,180 @@
+"""The avatar tab's content: every run's avatar baked for the page, what that costs, pictures from around, motions."""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ihbench import registry
+from ihbench.body.canonical import canonical_pose
+from ihbench.body.pose import BodyPose
+from ihbench.body.skeleton import PARENTS
+from ihbench.clock.progress import Progress
+from ihbench.errors import BadInput
+from ihbench.files.pictures import encoded
+from ihbench.metrics.eight_bit import displayed
+from ihbench.record.finished_run import FinishedRun
+from ihbench.record.results import RunResult
+from ihbench.reports.site.avatars import BAKING_POSES, PAINTED, BakedAvatar, bake, price
+from ihbench.reports.site.frames import Files, OpenScenes, SceneFrames
+from ihbench.reports.site.tables import number
+from ihbench.scene.regions import HIDDEN, NEVER_SEEN, VISIBLE
+from ihbench.scene.sightings import FINE
+from ihbench.scene.spread import spread
+from ihbench.scoring.scoring import Scorer
+from ihbench.show.framing import Framing, orbit
+from ihbench.show.motion import Motion, Stand, find_motion, placed, stand_of
+from ihbench.show.subject import CAPTURE, Subject
+
+A_POSE = "a_pose"
+SHOWN = ("march", "lunge", "bow", "turn", "wave", "kick")  # of the registered motions, as far as there are
+FPS = 15.0
+MOST_FRAMES = 90  # of a capture's own motion
+UNITS = 1e4  # steps of a radian in which angles travel
+PRICED_VIEWS = 4
+PRICED_MOTION = "bow"
+AROUND, SIDE = 12, 256  # pictures of a turntable, and their px
+QUALITY = 88  # of these pictures: they are to be looked at, nothing is measured on them
+PROCEDURAL = "procedural"
+
+
+def avatars(
+    results: Sequence[RunResult],
+    frames: Sequence[SceneFrames],
+    files: Files,
+    scenes: OpenScenes,
+    progress: Progress,
+    share: bool = False,
+) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """`avatars`, `motions` and what belongs to them as JSON, and the files that a page carries inside.
+
+    `share`: of avatars on another body than the bench's own, whose template and weights are under its licence, only
+    pictures.
+    """
+    made: dict[int, dict[str, Any]] = {}
+    carried = Files()
+    motions: dict[str, dict[str, Any]] = {}
+    for k, run in enumerate(results):
+        if run.status != "done" or not (run.folder / "avatar").is_dir():
+            continue
+        progress.say(f"avatar of {run.method} on {run.scene}, seed {run.seed}")
+        shown = next((f for f in frames if k in f.runs), None)
+        try:
+            made[k] = _avatar(run, shown, files, carried, scenes, motions, share)
+        except BadInput as error:
+            made[k] = {"reason": str(error), "turntable": [], "price": {}, "labels": {}, "capture": ""}
+    return {
+        "avatars": {str(k): about for k, about in made.items()},
+        "motions": motions,
+        "parents": list(PARENTS),
+        "a_pose": canonical_pose(A_POSE).ravel().tolist(),
+    }, carried.content
+
+
+def _avatar(
+    run: RunResult,
+    shown: SceneFrames | None,
+    files: Files,
+    carried: Files,
+    scenes: OpenScenes,
+    motions: dict[str, dict[str, Any]],
+    share: bool,
+) -> dict[str, Any]:
+    finished = FinishedRun(run.folder, scenes.data, scenes.body)
+    subject, opened = Subject(finished), scenes.of(run)
+    scorer = None if isinstance(opened, str) else opened[1]
+    about: dict[str, Any] = {"turntable": _turntable(subject, files), "price": {}, "labels": {}, "capture": ""}
+    if share and subject.body.name != PROCEDURAL:
+        return about | {"reason": f"its body, {subject.body.name}, may not be passed on with its weights (--share)"}
+    rest = BodyPose(canonical_pose(A_POSE), subject.betas, np.zeros(3))
+    views = () if scorer is None else scorer.scene.train
+    poses = [views[i].body_pose for i in spread(len(views), BAKING_POSES)] or [rest]
+    seen = None if scorer is None else scorer.scene.training.sightings[FINE].visibility
+    baked = bake(subject, poses, seen)
+    if isinstance(baked, str):
+        return about | {"reason": baked}
+    own, skin = baked.packed()
+    name = f"{shown.group if shown else 0} {run.scene}"
+    if "shared" not in motions:
+        known = registry.names("motion")
+        chosen = [motion for motion in SHOWN if motion in known]
+        body, betas = subject.body, subject.betas
+        motions["shared"] = {motion: _packed(find_motion(motion, FPS, body, betas)) for motion in chosen}
+    if scorer is not None and name not in motions:
+        motions[name] = {CAPTURE: _packed(_captured(subject))}
+    return about | baked.about | {
+        "reason": "",
+        "own": carried.add(own, ".bin"),
+        "skin": carried.add(skin, ".bin"),
+        "labels": _shares(baked),
+        "capture": name if name in motions else "",
+        "price": _prices(baked, subject, scorer, shown),
+    }  # fmt: skip
+
+
+def _shares(baked: BakedAvatar) -> dict[str, float]:
+    """Share of the Gaussians that each label has; zeros where nothing is known."""
+    labels = baked.labels
+    part = labels & 3
+    found = {"visible": part == VISIBLE, "hidden": part == HIDDEN, "never_seen": part == NEVER_SEEN}
+    found["painted"] = labels & PAINTED > 0
+    return {name: float(mask.mean()) for name, mask in found.items()}
+
+
+def _prices(
+    baked: BakedAvatar, subject: Subject, scorer: Scorer | None, shown: SceneFrames | None
+) -> dict[str, list[Any]]:
+    """Where it was measured -> [PSNR, IoU]: in some of the pictured test views, and in the middle of a motion."""
+    prices: dict[str, list[Any]] = {}
+    if scorer is None or shown is None:
+        return prices
+    background = scorer.scene.protocol.image.background
+    at = {(key.camera_id, key.frame): k for k, key in enumerate(scorer.scene.test_keys)}
+    for i in spread(len(shown.views), PRICED_VIEWS):
+        camera, frame = shown.views[i]["camera"], shown.views[i]["frame"]
+        view = scorer.scene.test[at[camera, frame]]
+        found = price(baked, subject, view.camera, view.body_pose, background)
+        prices[f"{camera}/{frame}"] = [number(found.psnr), number(found.iou)]
+    if PRICED_MOTION in registry.names("motion"):
+        motion = find_motion(PRICED_MOTION, FPS, subject.body, subject.betas)
+        pose = motion.body_poses(subject.betas)[len(motion) // 2]
+        camera = _framing(subject, pose).camera(0, 20.0, SIDE, SIDE)
+        found = price(baked, subject, camera, pose, background)
+        prices[f"motion {PRICED_MOTION}"] = [number(found.psnr), number(found.iou)]
+    return prices
+
+
+def _framing(subject: Subject, pose: BodyPose) -> Framing:
+    """A camera's view of one pose in SMPL's axes."""
+    stand = stand_of(subject.body, pose, np.array([0.0, 1.0, 0.0]))
+    return Framing.of([subject.body.pose(pose)], [0], stand.pelvis[None], stand)
+
+
+def _turntable(subject: Subject, files: Files) -> list[str]:
+    """Pictures of the A-pose from around, the first from the front."""
+    pose = BodyPose(canonical_pose(A_POSE), subject.betas, np.zeros(3))
+    names = []
+    for camera in orbit(_framing(subject, pose), AROUND, SIDE, SIDE):
+        rgb, _ = subject.avatar.render(camera, pose)
+        names.append(files.add(encoded(displayed(np.asarray(rgb)), "WEBP", quality=QUALITY), ".webp"))
+    return names
+
+
+def _captured(subject: Subject) -> Motion:
+    """The training frames' poses, upright and facing the camera at the start, as far as a page has room."""
+    whole = subject.motion(CAPTURE, FPS)
+    some = spread(len(whole), MOST_FRAMES)
+    body, rest = subject.body, subject.body.shaped(subject.betas)[1][0]
+    return placed(Motion(whole.pose[some], whole.transl[some], FPS), body, subject.betas, Stand(np.eye(3), rest))
+
+
+def _packed(motion: Motion) -> Mapping[str, Any]:
+    from scipy.spatial.transform import Rotation
+
+    turns = Rotation.from_rotvec(motion.pose.reshape(-1, 3)).as_rotvec()  # none beyond half a turn
+    angles: NDArray[np.int16] = np.rint(turns * UNITS).astype("<i2")
+    return {"fps": motion.fps, "frames": len(motion), "pose": b64encode(angles.tobytes()).decode("ascii")}
