@@ -36,7 +36,7 @@ GROUPS = {
 ROOMS = ("methods", "datasets", "protocols", "reports")  # of the bench: content, found by name
 NEEDS = {  # attributes of what is registered
     "report verb": ("main",),
-    "site": ("build", "write_folder", "write_single"),
+    "site": ("build", "write_folder", "write_single", "serve"),
     "dataset": ("check",),
     "stand-in": ("version", "protocol", "subjects", "ensure", "n_frames", "n_cameras"),
     "metric preset": ("about", "source", "measures"),

@@ -12,6 +12,7 @@ COMMANDS = {
     "report": "tables of finished runs, and error against run time",
     "figures": "figures as papers have them, from finished runs: PNG, PDF and the caption",
     "site": "an offline page of finished runs: tables, frames, curves, avatars that move",
+    "view": "the same on 127.0.0.1, following runs that are not done",
     "runs": "list the runs in a folder, one line each; remove some",
     "metrics": "check every metric against oracles, other libraries and stored values",
     "weights": "learned weights the bench may not ship: list, where, fetch",

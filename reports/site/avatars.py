@@ -190,11 +190,11 @@ def _weights(avatar: Any, body: Body, betas: Array, means: Array, pose: BodyPose
     own = getattr(avatar, "weights", None)
     if getattr(own, "shape", None) == (len(means), 24):
         return np.asarray(own.detach().cpu(), np.float64)  # pyright: ignore[reportOptionalMemberAccess]
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     texels = texel_table(body, FINE)
     surface = texels.interpolate(body.pose(BodyPose(pose.pose, betas, pose.transl)), body.faces)
-    nearest = cKDTree(surface).query(np.nan_to_num(means))[1]
+    nearest = KDTree(surface).query(np.nan_to_num(means))[1]
     return texels.interpolate(body.weights, body.faces)[nearest]
 
 
@@ -212,7 +212,7 @@ def _labels(subject: Subject, rest: Array, seen: Visibility | None) -> NDArray[n
     often as it was seen."""
     if seen is None:
         return np.zeros(len(rest), np.uint8)
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     body = subject.run.body
     texels = texel_table(body, FINE)
@@ -221,7 +221,7 @@ def _labels(subject: Subject, rest: Array, seen: Visibility | None) -> NDArray[n
     if painted is not None:
         of_texels[(painted > 0) & (painted >= seen.seen)] |= PAINTED
     surface = texels.interpolate(body.shaped(subject.betas)[0], body.faces)
-    return of_texels[cKDTree(surface).query(np.nan_to_num(rest))[1]]
+    return of_texels[KDTree(surface).query(np.nan_to_num(rest))[1]]
 
 
 def _narrow(plane: NDArray[np.uint8]) -> bytes:

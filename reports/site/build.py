@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,9 +31,10 @@ class Site:
     files: Mapping[str, bytes] = field(default_factory=dict)  # pictures by name
     carried: Mapping[str, bytes] = field(default_factory=dict)  # what a page must have inside: it may not read files
 
-    def html(self, single: bool = False, live: bool = False) -> str:
+    def html(self, single: bool = False, live: Mapping[str, Any] | None = None) -> str:
+        """The page; `single` with everything inside, `live` with what a served page must know of its server."""
         inside = {**self.carried, **(self.files if single else {})}
-        return page(self.title, self.data, inside, live)
+        return page(self.title, {**self.data, "live": live}, inside, live is not None)
 
 
 def build(
@@ -46,20 +47,23 @@ def build(
     body: Path | None = None,
     share: bool = False,
     progress: Progress | None = None,
+    scenes: OpenScenes | None = None,
+    pictures: bool = True,
 ) -> Site:
     """The site of these runs, with pictures of about `views` test views of a scene.
 
     `data` and `body` are the user's copies, where runs used any; without them there are no truths beside the
     predictions. `share` leaves out what a body model's licence does not let pass on. Raises `BadInput`
-    where there is no run.
+    where there is no run. `scenes` keeps what was opened for the next site; without `pictures` there are numbers
+    alone.
     """
     if not results:
         raise BadInput("there is no run to show")
     progress = progress or Progress()
-    files, scenes = Files(), OpenScenes(data, body)
+    files, scenes = Files(), scenes or OpenScenes(data, body)
     content = site_tables(results, left_out)
-    frames = scene_frames(results, files, scenes, views, progress)
-    moving, carried = avatars(results, frames, files, scenes, progress, share)
+    frames = scene_frames(results, files, scenes, views, progress) if pictures else []
+    moving, carried = avatars(results if pictures else (), frames, files, scenes, progress, share)
     content |= {"frames": [f.as_json for f in frames], **moving}
     content["made"] = f"Made by ihbench {__version__} from {len(results)} run{'s' * (len(results) != 1)}."
     content["notes"] = []
@@ -90,3 +94,25 @@ def write_single(site: Site, file: Path) -> int:
 
     atomic.write_bytes(file, text)
     return len(text)
+
+
+def serve(
+    read: Callable[[], tuple[list[RunResult], list[str]]],
+    port: int,
+    *,
+    views: int = 12,
+    title: str = TITLE,
+    data: Path | None = None,
+    body: Path | None = None,
+) -> None:
+    """Serve the site of what `read` gives on 127.0.0.1, made anew whenever a run has finished, until interrupted.
+    Raises `BadInput` for a port that cannot be had."""
+    from ihbench.reports.site.server import Followed
+    from ihbench.reports.site.server import serve as serve_followed
+
+    scenes, progress = OpenScenes(data, body), Progress()
+
+    def make(results: Sequence[RunResult], left_out: Sequence[str], pictures: bool) -> Site:
+        return build(results, left_out, views=views, title=title, progress=progress, scenes=scenes, pictures=pictures)
+
+    serve_followed(Followed(read, make), port, progress.say)

@@ -154,7 +154,7 @@ def _worst(run: RunResult) -> list[tuple[str, int]]:
         for i in [i for i in run.own if i.region == region][:1]:
             finite = [line for line in lines if i in line.scores and math.isfinite(line.scores[i])]
             sign = 1 if i.display.higher_is_better else -1
-            for line in sorted(finite, key=lambda line: sign * line.scores[i])[:1]:  # noqa: B023 - used at once
+            for line in sorted(finite, key=lambda line: sign * line.scores[i])[:1]:
                 worst.append((str(line.camera), line.frame))
     return worst
 

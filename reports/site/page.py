@@ -12,7 +12,7 @@ from typing import Any
 
 from ihbench.document.html import escape
 
-SCRIPTS = ("dom", "leaderboard", "frames", "curves", "splats", "avatar", "about", "app")  # in this order
+SCRIPTS = ("dom", "leaderboard", "frames", "curves", "splats", "avatar", "about", "live", "app")  # in this order
 
 
 @cache
@@ -48,7 +48,8 @@ def policy(live: bool = False) -> str:
 
 
 def page(title: str, data: Mapping[str, Any], inside: Mapping[str, bytes], live: bool = False) -> str:
-    """The whole page. `data` is strict JSON; `inside` are files that the page carries in itself, by name."""
+    """The whole page. `data` is strict JSON; `inside` are files that the page carries in itself, by name; `live` as
+    `policy` has it."""
     carried = "\n".join(
         f'<script type="text/plain" id="file-{escape(name)}">{b64encode(content).decode("ascii")}</script>'
         for name, content in inside.items()

@@ -177,7 +177,7 @@ def _run(run: RunResult, group: int, label: str) -> Json:
         "means": [number(run.own[i].value) for i in identities],
         "views": _views(run, identities, reasons),
         "reasons": list(reasons),
-        "curve": _curve(run),
+        "curve": curve_json(run),
         "stages": _stages(run),
         "wall": record.ledger.seconds if record.ledger is not None else None,
         "fit": about.fit_seconds,
@@ -242,7 +242,8 @@ def _score(line: ScoreLine, identity: Identity, reasons: dict[str, int]) -> Any:
     return number(value)
 
 
-def _curve(run: RunResult) -> list[Json]:
+def curve_json(run: RunResult) -> list[Json]:
+    """The points of a run's quality-time curve."""
     return [
         {
             "step": point.step,

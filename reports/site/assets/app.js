@@ -71,3 +71,4 @@ document.getElementById("theme").addEventListener("click", (event) => {
 });
 addEventListener("hashchange", show);
 show();
+follow();
