@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from rich.cells import cell_len, set_cell_size
 
+from ihbench.document.document import Block, Heading, Paragraph, Table
 from ihbench.errors import visible
 from ihbench.metrics import Identity
 from ihbench.record.results import TRACEBACK, NotRun, RunResult, by_group
@@ -59,6 +60,25 @@ def write(
         lines += _wrapped(note, width)
     lines += _wrapped("all regions, seconds, notes and tests: --full", width)
     return "\n".join(lines) + "\n"
+
+
+def headline_section(results: Sequence[RunResult]) -> list[Block]:
+    """The same tables for the top of a page; nothing where no run is done."""
+    blocks: list[Block] = []
+    for runs in by_group(run for run in results if run.status == "done").values():
+        protocol, _, profile, data = runs[0].group
+        headline = runs[0].headline
+        own = [run.own for run in runs]
+        identities = [i for i in dict.fromkeys(i for means in own for i in means) if i.region == headline]
+        present = [i for i in identities if any(i in means and not means[i].absent for means in own)]
+        head = ("method", *(i.display.head() for i in present), "fit s")
+        rows = tuple((name, *cells) for name, cells in _rows(runs, present))
+        scenes = sorted({run.scene for run in runs})
+        note = (
+            f"{protocol}, {profile} profile, {data}; region {headline}, mean over test views of {', '.join(scenes)}."
+        )
+        blocks += [Paragraph(note), Table(head, rows)]
+    return [Heading(2, "Headline"), *blocks] if blocks else []
 
 
 def _group(runs: Sequence[RunResult], width: int, not_run: Sequence[str]) -> list[str]:

@@ -12,6 +12,7 @@ from ihbench.document.short_names import LONG, with_short_names
 from ihbench.record.quality_time import Target
 from ihbench.record.results import RunResult
 from ihbench.reports.general.content import general_report, score_tables
+from ihbench.reports.general.headline import headline_section
 
 
 def write(
@@ -27,7 +28,7 @@ def write(
 ) -> str:
     """The report of these runs; see `general_report`. In LaTeX all row names are short, their switches stand below.
 
-    A page has the runs' own pictures in it, and diagrams: the ones given, else its own."""
+    A page has the headline on top, the runs' own pictures in it, and diagrams: the ones given, else its own."""
     longest = 0 if form == "tex" else LONG
     if fragment:
         return document.write_fragment(with_short_names(score_tables(results, presets), longest), form)
@@ -37,8 +38,9 @@ def write(
             from ihbench.reports.general.run_pictures import run_pictures
 
             pictures = [*(pictures or draw(results, Path(name))), *run_pictures(results)]
-        blocks = with_short_names(general_report(results, presets, targets, pictures, left_out), longest)
-        return document.write(blocks, form, folder)
+        top = headline_section(results) if form == "html" else []
+        blocks = [*top, *general_report(results, presets, targets, pictures, left_out)]
+        return document.write(with_short_names(blocks, longest), form, folder)
 
 
 MARKDOWN, LATEX, HTML = (partial(write, form) for form in ("md", "tex", "html"))

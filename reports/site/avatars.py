@@ -1,15 +1,15 @@
 """Avatars that a page can move by itself: Gaussians at rest with skinning weights, baked from any method whose avatar
-has circles to draw, small enough to travel inside the page, and what the baking costs.
+gives its Gaussians in a pose, small enough to travel inside the page, and what the baking costs.
 
-A pose-dependent part cannot be skinned. It is averaged over poses of the training views (each taken back to rest by
-the inverse of its own blend), and the price is measured against the method's own drawing.
+What depends on the pose or on the direction of view cannot be skinned. It is averaged over some training views (each
+taken back to rest by the inverse of its own blend), and the price is measured against the method's own drawing.
 """
 
 from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ihbench.body.canonical import canonical_pose
 from ihbench.body.pose import BodyPose
-from ihbench.body.skinning_numpy import lbs
 from ihbench.body.uv import texel_table
 from ihbench.camera import Camera
 from ihbench.metrics.eight_bit import displayed
@@ -41,14 +41,23 @@ SOLID = 0.5  # alpha from which a pixel is the person
 BAKING_POSES = 6
 
 
+@dataclass(frozen=True)
+class Sight:
+    """A pose that an avatar is baked from, and where the camera stood that saw it."""
+
+    pose: BodyPose
+    center: Array | None = None  # [3] m, world; None: from nowhere, colours are those of no direction
+
+
 @dataclass(frozen=True, eq=False)
 class BakedAvatar:
-    """N circles at rest. What a page draws is exactly this: everything is rounded to what travels."""
+    """N Gaussians at rest: opaque circles, or general ones with `turns` and `opacities`. What a page draws is exactly
+    this: everything is rounded to what travels."""
 
     rest: Array  # [N, 3] m, in the body's shaped T-pose, where its weights apply
     bones: NDArray[np.uint8]  # [N, 4] joints
     weights: NDArray[np.uint8]  # [N, 4] in 255ths, that add up to 255
-    scales: Array  # [N] m
+    scales: Array  # [N] m, or [N, 3] along axes of their own
     colours: NDArray[np.uint8]  # [N, 3]
     labels: NDArray[np.uint8]  # [N] of `scene.regions`, and PAINTED
     joints: Array  # [24, 3] m, of the shaped T-pose
@@ -56,6 +65,8 @@ class BakedAvatar:
     low: Array  # [3] m, and size: the box that positions are rounded in
     size: Array
     scale_range: tuple[float, float]  # m
+    turns: Array | None = None  # [N, 3] x y z of unit quaternions whose w is not negative; None: circles
+    opacities: NDArray[np.uint8] | None = None  # [N] in 255ths; None: opaque
 
     def __len__(self) -> int:
         return len(self.rest)
@@ -63,16 +74,17 @@ class BakedAvatar:
     @cached_property
     def whole_weights(self) -> Array:
         """[N, 24]"""
-        whole = np.zeros((len(self), 24))
-        np.add.at(whole, (np.arange(len(self))[:, None], self.bones), self.weights / LEVELS8)
-        return whole
+        return _spread(self.bones, self.weights)
+
+    def blend(self, body: Body, body_pose: BodyPose) -> Array:
+        """[N, 3, 4] rest to world."""
+        own = BodyPose(body_pose.pose, self.betas, body_pose.transl)
+        return np.tensordot(self.whole_weights, body.joint_transforms(own)[:, :3], 1)
 
     def means(self, body: Body, body_pose: BodyPose) -> Array:
         """[N, 3] m, world."""
-        return lbs(self.rest, self.whole_weights, body.joint_transforms(self._own(body_pose)))
-
-    def _own(self, body_pose: BodyPose) -> BodyPose:
-        return BodyPose(body_pose.pose, self.betas, body_pose.transl)
+        blend = self.blend(body, body_pose)
+        return np.einsum("nab,nb->na", blend[:, :, :3], self.rest) + blend[:, :, 3]
 
     def render(
         self, body: Body, camera: Camera, body_pose: BodyPose, background: tuple[float, float, float]
@@ -82,24 +94,38 @@ class BakedAvatar:
 
         from ihbench.render.splat import render_gaussians
 
-        means = torch.from_numpy(self.means(body, body_pose).astype(np.float32))
-        scales = torch.from_numpy(self.scales.astype(np.float32))
-        colours = torch.from_numpy((self.colours / LEVELS8).astype(np.float32))
+        def tensor(values: Array) -> torch.Tensor:
+            return torch.from_numpy(np.ascontiguousarray(values, np.float32))
+
+        means, colours = tensor(self.means(body, body_pose)), tensor(self.colours / LEVELS8)
         with torch.no_grad():
-            rgb, alpha = render_gaussians(means, scales, colours, camera, background)
+            if self.turns is None or self.opacities is None:
+                rgb, alpha = render_gaussians(means, tensor(self.scales), colours, camera, background)
+            else:
+                factor = self.blend(body, body_pose)[:, :, :3] @ _axes(self.turns) * self.scales[:, None, :]
+                covariances = tensor(factor @ factor.transpose(0, 2, 1))
+                opacities = tensor(self.opacities / LEVELS8)
+                rgb, alpha = render_gaussians(
+                    means, covariances, colours, camera, background, opacities=opacities, preset="3dgs"
+                )
         return rgb.clamp(0, 1).numpy(), alpha.numpy()
 
     def packed(self) -> tuple[bytes, bytes]:
-        """What travels: places, sizes, colours and labels; and bones and weights, which avatars of one body share.
+        """What travels: places, sizes, colours and labels, of general ones also turns and opacities; and bones and
+        weights, which avatars of one body share.
 
         Planes of numbers, one after the other, each as differences from the number before (wrapped around), 16-bit
         ones as a plane of low and a plane of high bytes; deflated.
         """
         places = np.rint((self.rest - self.low) / self.size * LEVELS16).astype(np.uint16)
+        own = [_wide(places[:, k]) for k in range(3)]
         low, high = np.log(self.scale_range)
-        sizes = np.rint((np.log(self.scales) - low) / max(high - low, 1e-12) * LEVELS16).astype(np.uint16)
-        own = [*(_wide(places[:, k]) for k in range(3)), _wide(sizes), *(_narrow(c) for c in self.colours.T)]
-        own.append(_narrow(self.labels))
+        sizes = np.rint((np.log(self.scales.reshape(len(self), -1)) - low) / (high - low) * LEVELS16)
+        own += [_wide(plane.astype(np.uint16)) for plane in sizes.T]
+        if self.turns is not None and self.opacities is not None:
+            own += [_wide(np.rint((plane + 1) / 2 * LEVELS16).astype(np.uint16)) for plane in self.turns.T]
+            own.append(_narrow(self.opacities))
+        own += [*(_narrow(plane) for plane in self.colours.T), _narrow(self.labels)]
         skin = [_narrow(plane) for plane in (*self.bones.T, *self.weights.T)]
         return _deflated(b"".join(own)), _deflated(b"".join(skin))
 
@@ -109,37 +135,59 @@ class BakedAvatar:
         return {
             "count": len(self), "low": self.low.tolist(), "size": self.size.tolist(),
             "scales": list(self.scale_range), "joints": np.round(self.joints, 7).tolist(),
+            "general": self.turns is not None,
         }  # fmt: skip
 
 
-def bake(subject: Subject, poses: Sequence[BodyPose], seen: Visibility | None) -> BakedAvatar | str:
+@dataclass(frozen=True)
+class _Drawn:
+    """Gaussians in one pose, as numbers."""
+
+    means: Array  # [N, 3]
+    scales: Array  # [N], or covariances [N, 3, 3] m²
+    colours: Array  # [N, 3]
+    opacities: Array | None  # [N]
+
+
+def bake(subject: Subject, sights: Sequence[Sight], seen: Visibility | None) -> BakedAvatar | str:
     """The avatar at rest, averaged over some poses; or why it cannot be had. `seen` is what the training views showed
     on the fine grid of texels; without it nothing is labelled."""
     avatar, body, betas = subject.avatar, subject.body, subject.betas
-    draw = getattr(avatar, "gaussians", None)
-    if not callable(draw) or hasattr(draw, "opacities"):
-        return "its avatar has no opaque circles that could be skinned in a page"
-    drawn = [_numbers(draw(pose)) for pose in poses]
-    count = len(drawn[0][0])
-    if any(len(means) != count or scales.ndim != 1 for means, scales, _ in drawn):
+    draw = _drawer(avatar)
+    if draw is None:
+        return "its avatar has no Gaussians that could be skinned in a page"
+    drawn = [_numbers(draw(sight.pose), sight.center) for sight in sights]
+    first, count = drawn[0], len(drawn[0].means)
+    if any(len(d.means) != count or d.scales.ndim != first.scales.ndim for d in drawn):
         return "its avatar has other Gaussians in every pose"
-    weights = _weights(avatar, body, betas, drawn[0][0], poses[0])
-    bones, rounded = _four(weights)
-    whole = np.zeros((count, 24))
-    np.add.at(whole, (np.arange(count)[:, None], bones), rounded / LEVELS8)
-    rests = []
-    for (means, _, _), pose in zip(drawn, poses, strict=True):
-        transforms = body.joint_transforms(BodyPose(pose.pose, betas, pose.transl))
+    bones, rounded = _four(_weights(avatar, body, betas, count, draw))
+    whole = _spread(bones, rounded)
+    rests, shapes = [], []
+    for d, sight in zip(drawn, sights, strict=True):
+        transforms = body.joint_transforms(BodyPose(sight.pose.pose, betas, sight.pose.transl))
         blend = np.tensordot(whole, transforms[:, :3], 1)
-        rests.append(np.linalg.solve(blend[:, :, :3], (means - blend[:, :, 3])[:, :, None])[:, :, 0])
-    rest = np.mean(rests, 0)
-    scales = np.exp(np.mean([np.log(np.maximum(s, 1e-6)) for _, s, _ in drawn], 0))
-    colours = np.mean([c for *_, c in drawn], 0)
-    labels = _labels(subject, rest, seen)
-    kept = np.isfinite(np.column_stack([rest, scales, colours])).all(1)
-    rest, scales, colours = rest[kept], scales[kept], colours[kept]
-    if not len(rest):
-        return "none of its Gaussians is finite"
+        back = np.linalg.inv(blend[:, :, :3])
+        rests.append(np.einsum("nab,nb->na", back, d.means - blend[:, :, 3]))
+        shapes.append(
+            np.log(np.maximum(d.scales, 1e-6)) if d.scales.ndim == 1 else back @ d.scales @ back.swapaxes(1, 2)
+        )
+    rest, shape, colours = np.mean(rests, 0), np.mean(shapes, 0), np.mean([d.colours for d in drawn], 0)
+    opacities = (
+        None if first.opacities is None else np.mean([d.opacities for d in drawn if d.opacities is not None], 0)
+    )
+    flat = [
+        rest,
+        shape.reshape(count, -1),
+        colours,
+        np.zeros((count, 0)) if opacities is None else opacities[:, None],
+    ]
+    kept = np.isfinite(np.column_stack(flat)).all(1)
+    if opacities is not None:
+        kept &= np.rint(opacities * LEVELS8) >= 1  # the rest is not drawn
+    if not kept.any():
+        return "none of its Gaussians is finite and seen"
+    rest, shape = rest[kept], shape[kept]
+    scales, turns = (np.exp(shape), None) if shape.ndim == 1 else _axes_of(shape)
     low, size = rest.min(0), np.maximum(np.ptp(rest, 0), 1e-6)
     span = float(scales.min()), float(max(scales.max(), scales.min() * 1.0001))
     log_low, log_size = math.log(span[0]), math.log(span[1] / span[0])
@@ -148,13 +196,15 @@ def bake(subject: Subject, poses: Sequence[BodyPose], seen: Visibility | None) -
         bones[kept],
         rounded[kept],
         np.exp(log_low + np.rint((np.log(scales) - log_low) / log_size * LEVELS16) / LEVELS16 * log_size),
-        displayed(np.clip(colours, 0, 1)[None])[0],
-        labels[kept],
+        displayed(np.clip(colours[kept], 0, 1)[None])[0],
+        _labels(subject, rest, seen),
         body.shaped(betas)[1],
         np.asarray(betas, np.float64),
         low,
         size,
         span,
+        None if turns is None else np.rint((turns + 1) / 2 * LEVELS16) / LEVELS16 * 2 - 1,
+        None if opacities is None else np.rint(opacities[kept] * LEVELS8).astype(np.uint8),
     )
 
 
@@ -180,22 +230,84 @@ def price(
     return Price(decibels, float((ours & theirs).sum() / either.sum()))
 
 
-def _numbers(gaussians: Any) -> tuple[Array, Array, Array]:
-    means, scales, colours = (np.asarray(v.detach().cpu(), np.float64) for v in gaussians[:3])
-    return means, scales, colours
+def _drawer(avatar: Any) -> Callable[[BodyPose], Any] | None:
+    """What gives an avatar's Gaussians in a pose: `posed_gaussians` with all that `render_gaussians` takes, or
+    `gaussians` with means, scales and colours of circles."""
+    posed = getattr(avatar, "posed_gaussians", None)
+    if callable(posed):
+        return posed
+    circles = getattr(avatar, "gaussians", None)
+    return circles if callable(circles) and not hasattr(circles, "opacities") else None
 
 
-def _weights(avatar: Any, body: Body, betas: Array, means: Array, pose: BodyPose) -> Array:
-    """[N, 24] the avatar's own, or those of the nearest point of the posed body."""
+def _numbers(gaussians: Any, center: Array | None) -> _Drawn:
+    """Circles stay circles; others have covariances and opacities. Spherical harmonics become the colours that a
+    camera at `center` sees, or those of no direction."""
+    import torch
+
+    from ihbench.render.spherical_harmonics import colors_of
+    from ihbench.render.splat_projection import covariances_of
+
+    with torch.no_grad():
+        if isinstance(gaussians, tuple):
+            means, scales, colours = gaussians[:3]
+            quaternions, opacities, degree = None, None, None
+        else:
+            means, scales, colours = gaussians.means, gaussians.scales, gaussians.colors
+            quaternions, opacities, degree = gaussians.quaternions, gaussians.opacities, gaussians.sh_degree
+        if degree is not None:
+            far = means.mean(0) + 1.0 if center is None else torch.from_numpy(np.asarray(center)).to(means.device)
+            colours = colors_of(colours, means, far, 0 if center is None else degree)
+        if (scales.ndim == 1 and opacities is not None) or scales.ndim == 2:
+            scales = covariances_of(scales, quaternions)
+        if scales.ndim == 3 and opacities is None:
+            opacities = means.new_ones(len(means))
+
+        def numbers(values: torch.Tensor) -> Array:
+            return np.asarray(values.detach().cpu(), np.float64)
+
+        return _Drawn(
+            numbers(means), numbers(scales), numbers(colours), None if opacities is None else numbers(opacities)
+        )
+
+
+def _axes(turns: Array) -> Array:
+    """[N, 3, 3] of quaternions [N, 3] without their w."""
+    from scipy.spatial.transform import Rotation
+
+    w = np.sqrt(np.maximum(1 - (turns**2).sum(1, keepdims=True), 0))
+    return Rotation.from_quat(np.concatenate([turns, w], 1)).as_matrix()
+
+
+def _axes_of(covariances: Array) -> tuple[Array, Array]:
+    """[N, 3] standard deviations, at least a micrometre, and [N, 3] the quaternions of their axes without w."""
+    from scipy.spatial.transform import Rotation
+
+    values, axes = np.linalg.eigh((covariances + covariances.swapaxes(1, 2)) / 2)
+    axes[np.linalg.det(axes) < 0, :, 0] *= -1
+    turns = Rotation.from_matrix(axes).as_quat(canonical=True)
+    return np.sqrt(np.maximum(values, 1e-12)), turns[:, :3]
+
+
+def _weights(avatar: Any, body: Body, betas: Array, count: int, draw: Callable[[BodyPose], Any]) -> Array:
+    """[N, 24] the avatar's own, or those of the nearest point of the body, in a pose with its limbs apart."""
     own = getattr(avatar, "weights", None)
-    if getattr(own, "shape", None) == (len(means), 24):
+    if getattr(own, "shape", None) == (count, 24):
         return np.asarray(own.detach().cpu(), np.float64)  # pyright: ignore[reportOptionalMemberAccess]
     from scipy.spatial import KDTree
 
     texels = texel_table(body, FINE)
-    surface = texels.interpolate(body.pose(BodyPose(pose.pose, betas, pose.transl)), body.faces)
-    nearest = KDTree(surface).query(np.nan_to_num(means))[1]
+    apart = BodyPose(canonical_pose("a_pose"), betas, np.zeros(3))
+    surface = texels.interpolate(body.pose(apart), body.faces)
+    nearest = KDTree(surface).query(np.nan_to_num(_numbers(draw(apart), None).means))[1]
     return texels.interpolate(body.weights, body.faces)[nearest]
+
+
+def _spread(bones: NDArray[np.uint8], weights: NDArray[np.uint8]) -> Array:
+    """[N, 24] of four joints and their weights in 255ths."""
+    whole = np.zeros((len(bones), 24))
+    np.add.at(whole, (np.arange(len(bones))[:, None], bones), weights / LEVELS8)
+    return whole
 
 
 def _four(weights: Array) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:

@@ -19,7 +19,7 @@ from ihbench.files.pictures import encoded
 from ihbench.metrics.eight_bit import displayed
 from ihbench.record.finished_run import FinishedRun
 from ihbench.record.results import RunResult
-from ihbench.reports.site.avatars import BAKING_POSES, PAINTED, BakedAvatar, bake, price
+from ihbench.reports.site.avatars import BAKING_POSES, PAINTED, BakedAvatar, Sight, bake, price
 from ihbench.reports.site.frames import Files, OpenScenes, SceneFrames
 from ihbench.reports.site.tables import number
 from ihbench.scene.regions import HIDDEN, NEVER_SEEN, VISIBLE
@@ -36,7 +36,7 @@ FPS = 15.0
 MOST_FRAMES = 90  # of a capture's own motion
 UNITS = 1e4  # steps of a radian in which angles travel
 PRICED_VIEWS = 4
-PRICED_MOTION = "bow"
+PRICED_MOTIONS = ("bow", "march")
 AROUND, SIDE = 12, 256  # pictures of a turntable, and their px
 QUALITY = 88  # of these pictures: they are to be looked at, nothing is measured on them
 PROCEDURAL = "procedural"
@@ -91,10 +91,10 @@ def _avatar(
     if share and subject.body.name != PROCEDURAL:
         return about | {"reason": f"its body, {subject.body.name}, may not be passed on with its weights (--share)"}
     rest = BodyPose(canonical_pose(A_POSE), subject.betas, np.zeros(3))
-    views = () if scorer is None else scorer.scene.train
-    poses = [views[i].body_pose for i in spread(len(views), BAKING_POSES)] or [rest]
+    views = [] if scorer is None else [scorer.scene.train[i] for i in spread(len(scorer.scene.train), BAKING_POSES)]
+    sights = [Sight(view.body_pose, view.camera.center) for view in views] or [Sight(rest)]
     seen = None if scorer is None else scorer.scene.training.sightings[FINE].visibility
-    baked = bake(subject, poses, seen)
+    baked = bake(subject, sights, seen)
     if isinstance(baked, str):
         return about | {"reason": baked}
     own, skin = baked.packed()
@@ -139,12 +139,12 @@ def _prices(
         view = scorer.scene.test[at[camera, frame]]
         found = price(baked, subject, view.camera, view.body_pose, background)
         prices[f"{camera}/{frame}"] = [number(found.psnr), number(found.iou)]
-    if PRICED_MOTION in registry.names("motion"):
-        motion = find_motion(PRICED_MOTION, FPS, subject.body, subject.betas)
-        pose = motion.body_poses(subject.betas)[len(motion) // 2]
+    for name in [name for name in PRICED_MOTIONS if name in registry.names("motion")]:
+        motion = find_motion(name, FPS, subject.body, subject.betas)
+        pose = motion.body_poses(subject.betas)[len(motion) // 4]
         camera = _framing(subject, pose).camera(0, 20.0, SIDE, SIDE)
         found = price(baked, subject, camera, pose, background)
-        prices[f"motion {PRICED_MOTION}"] = [number(found.psnr), number(found.iou)]
+        prices[f"motion {name}"] = [number(found.psnr), number(found.iou)]
     return prices
 
 

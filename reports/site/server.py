@@ -58,7 +58,10 @@ class Followed:
                 self._show(self.make(results, left_out, False))
             self._show(self.make(results, left_out, True))
             self._done = done
-        except (BadInput, OSError) as error:  # a folder that is being written or moved: the next look may find it whole
+        except (
+            BadInput,
+            OSError,
+        ) as error:  # a folder that is being written or moved: the next look may find it whole
             self.fault = str(error)
 
     def _show(self, site: Site) -> None:

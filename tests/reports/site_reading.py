@@ -69,21 +69,64 @@ def unpacked(own: bytes, skin: bytes, about: dict[str, Any]) -> dict[str, np.nda
     """What a page makes of an avatar's two files."""
     n = about["count"]
     own, skin = (np.frombuffer(zlib.decompress(data, -15), np.uint8) for data in (own, skin))
-    assert (len(own), len(skin)) == (12 * n, 8 * n)
+    assert (len(own), len(skin)) == ((23 if about["general"] else 12) * n, 8 * n)
+    at = 0
 
-    def wide(at):
-        steps = own[at : at + n].astype(np.uint16) + 256 * own[at + n : at + 2 * n].astype(np.uint16)
-        return np.cumsum(steps, dtype=np.uint16) / 65535
+    def wides(count):
+        nonlocal at
+        planes = []
+        for _ in range(count):
+            low, high = own[at : at + n].astype(np.uint16), own[at + n : at + 2 * n].astype(np.uint16)
+            planes.append(np.cumsum(low + 256 * high, dtype=np.uint16) / 65535)
+            at += 2 * n
+        return np.stack(planes, 1)
 
-    def narrow(data, at):
-        return np.cumsum(data[at : at + n], dtype=np.uint8)
+    def narrows(count):
+        nonlocal at
+        at += count * n
+        return np.stack([np.cumsum(own[at - (count - k) * n :][:n], dtype=np.uint8) for k in range(count)], 1)
 
     low, high = np.log(about["scales"])
-    return {
-        "rest": np.stack([about["low"][k] + wide(2 * n * k) * about["size"][k] for k in range(3)], 1),
-        "scales": np.exp(low + wide(6 * n) * (high - low)),
-        "colours": np.stack([narrow(own, (8 + k) * n) for k in range(3)], 1),
-        "labels": narrow(own, 11 * n),
-        "bones": np.stack([narrow(skin, k * n) for k in range(4)], 1),
-        "weights": np.stack([narrow(skin, k * n) for k in range(4, 8)], 1),
-    }
+    found = {"rest": np.array(about["low"]) + wides(3) * about["size"]}
+    if about["general"]:
+        found |= {"scales": np.exp(low + wides(3) * (high - low)), "turns": 2 * wides(3) - 1}
+        found["opacities"] = narrows(1)[:, 0]
+    else:
+        found["scales"] = np.exp(low + wides(1)[:, 0] * (high - low))
+    found |= {"colours": narrows(3), "labels": narrows(1)[:, 0]}
+    planes = np.cumsum(skin.reshape(8, n), 1, dtype=np.uint8)
+    return found | {"bones": planes[:4].T, "weights": planes[4:].T}
+
+
+@dataclass
+class Plates:
+    """An avatar of flat, half transparent Gaussians on the body, moved by the body alone; any colours."""
+
+    body: Any
+    betas: np.ndarray
+    count: int = 900
+
+    def __post_init__(self):
+        from ihbench.body.uv import texel_table
+
+        rng = np.random.default_rng(0)
+        texels = texel_table(self.body, 64)
+        some = np.sort(rng.choice(len(texels.face), self.count, replace=False))
+        self.rest = texels.interpolate(self.body.shaped(self.betas)[0], self.body.faces)[some]
+        self.weights_ = texels.interpolate(self.body.weights, self.body.faces)[some]
+        self.factors = rng.normal(size=(self.count, 3, 3)) * (0.03, 0.01, 0.002)
+        self.opacities, self.colours = rng.uniform(0.2, 1, self.count), rng.uniform(0, 1, (self.count, 3))
+
+    def posed_gaussians(self, pose):
+        from types import SimpleNamespace
+
+        import torch
+
+        blend = np.tensordot(self.weights_, self.body.joint_transforms(pose)[:, :3], 1)
+        factors = blend[:, :, :3] @ self.factors
+        means = np.einsum("nab,nb->na", blend[:, :, :3], self.rest) + blend[:, :, 3]
+        parts = (means, factors @ factors.transpose(0, 2, 1), self.colours, self.opacities)
+        means, covariances, colours, opacities = (torch.from_numpy(part.astype(np.float32)) for part in parts)
+        return SimpleNamespace(
+            means=means, scales=covariances, colors=colours, quaternions=None, opacities=opacities, sh_degree=None
+        )

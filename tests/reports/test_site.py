@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from ihbench.body import load_body
@@ -31,7 +32,7 @@ from ihbench.scene.mask_state import MaskState
 from ihbench.scoring.scoring import Scorer
 from ihbench.show.subject import Subject
 from tests.reports import fake_runs
-from tests.reports.site_reading import Page, sha256, unpacked, value
+from tests.reports.site_reading import Page, Plates, sha256, unpacked, value
 
 HOSTILE = "<img src=x onerror=\"document.title='taken'\">&</script><script>alert(1)</script>"
 
@@ -195,8 +196,8 @@ def test_an_avatar_travels(studio, site, finished):
     with studio.in_its_world():
         run = FinishedRun(finished.folder)
         subject, scene = Subject(run), run.scene
-        poses = [scene.train[k].body_pose for k in range(3)]
-        baked = avatars.bake(subject, poses, scene.training.sightings[avatars.FINE].visibility)
+        sights = [avatars.Sight(scene.train[k].body_pose) for k in range(3)]
+        baked = avatars.bake(subject, sights, scene.training.sightings[avatars.FINE].visibility)
         again = unpacked(*baked.packed(), baked.about)
         for name, values in again.items():
             assert np.allclose(values, getattr(baked, name), atol=1e-9), name
@@ -228,16 +229,49 @@ def test_a_price_is_paid_for_what_was_changed(studio, finished):
     with studio.in_its_world():
         run = FinishedRun(finished.folder)
         subject, view = Subject(run), run.scene.test[0]
-        baked = avatars.bake(subject, [view.body_pose], None)
+        baked = avatars.bake(subject, [avatars.Sight(view.body_pose)], None)
         object.__setattr__(baked, "rest", baked.rest + 0.02)
         paid = avatars.price(baked, subject, view.camera, view.body_pose, (1.0, 1.0, 1.0))
     assert paid.psnr < 30
     assert paid.iou < 0.97
 
 
+def test_general_gaussians_come_back_from_any_pose():
+    body, betas = load_body(), np.zeros(10)
+    rng = np.random.default_rng(1)
+    poses = [BodyPose(0.3 * rng.normal(size=(24, 3)), betas, rng.normal(size=3)) for _ in range(3)]
+    plates = Plates(body, betas)
+    subject = SimpleNamespace(avatar=plates, body=body, betas=betas)
+    baked = avatars.bake(subject, [avatars.Sight(pose) for pose in poses], None)  # type: ignore[arg-type]
+    found = unpacked(*baked.packed(), baked.about)
+    for name, values in found.items():
+        assert np.allclose(values, getattr(baked, name), atol=1e-9), name
+    far = np.abs(baked.rest - plates.rest).max(
+        1
+    )  # weights may be those of a neighbouring point
+    assert np.median(far) < 2e-3
+    assert np.quantile(far, 0.95) < 0.02
+    factors = avatars._axes(baked.turns) * baked.scales[:, None, :]
+    expected = plates.factors @ plates.factors.transpose(0, 2, 1)
+    error = np.abs(factors @ factors.transpose(0, 2, 1) - expected).max((1, 2)) / np.abs(expected).max((1, 2))
+    assert np.median(error) < 0.02
+    assert np.abs(baked.opacities / 255 - plates.opacities).max() < 0.003
+
+
+def test_colours_of_a_direction_are_those_that_the_cameras_saw():
+    gaussians = SimpleNamespace(
+        means=torch.zeros(2, 3), scales=torch.ones(2, 3), quaternions=torch.tensor([[1.0, 0, 0, 0]] * 2),
+        opacities=torch.ones(2), sh_degree=1, colors=torch.tensor([[[0.4] * 3, [0.0] * 3, [0.3] * 3, [0.0] * 3]] * 2),
+    )  # fmt: skip
+    front, back, nowhere = (avatars._numbers(gaussians, c).colours[0, 0] for c in ([0, 0, 3.0], [0, 0, -3.0], None))
+    c0, c1 = 0.28209479177387814, 0.4886025119029199
+    assert (front, back) == pytest.approx((0.5 + 0.4 * c0 - 0.3 * c1, 0.5 + 0.4 * c0 + 0.3 * c1), abs=1e-6)
+    assert nowhere == pytest.approx(0.5 + 0.4 * c0, abs=1e-6)
+
+
 def test_what_cannot_be_skinned_says_so():
     subject = SimpleNamespace(avatar=SimpleNamespace(), body=load_body(), betas=np.zeros(10))
-    assert "no opaque circles" in avatars.bake(subject, [], None)  # type: ignore[arg-type]
+    assert "no Gaussians" in avatars.bake(subject, [], None)  # type: ignore[arg-type]
 
 
 def test_painted_surface_is_what_painted_pixels_show(tmp_path):

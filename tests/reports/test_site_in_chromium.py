@@ -5,20 +5,22 @@ import base64
 import io
 import json
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from ihbench.body import load_body
 from ihbench.body.pose import BodyPose
 from ihbench.metrics.eight_bit import displayed
 from ihbench.metrics.psnr import psnr
 from ihbench.record.finished_run import FinishedRun
 from ihbench.record.results import read_result
-from ihbench.reports.site import build
+from ihbench.reports.site import avatars, build
 from ihbench.show.subject import Subject
 from tests.reports.chromium import BROWSER, Chromium
-from tests.reports.site_reading import Page, value
+from tests.reports.site_reading import Page, Plates, value
 
 pytestmark = pytest.mark.skipif(BROWSER is None, reason="no Chromium here: chromium, chromium-browser, google-chrome")
 
@@ -224,6 +226,31 @@ def test_the_avatar_is_drawn_as_the_bench_draws_it(opened, studio, site, finishe
             assert (here & there).sum() / (here | there).sum() >= SILHOUETTE
         stood, _ = subject.avatar.render(truth.camera, pose)
         assert psnr(displayed(stood), displayed(rgb)) < MOVED  # a motion that does not move would be seen
+
+
+def test_general_gaussians_are_drawn_as_the_bench_draws_them(opened, studio, site, finished, tmp_path):
+    """Flat and half transparent ones, in a test view and moved."""
+    view = site.data["frames"][0]["views"][0]
+    with studio.in_its_world():
+        scene = FinishedRun(finished.folder).scene
+        truth = next(v for v in scene.test if (v.camera_id, v.frame) == (view["camera"], view["frame"]))
+        body, pose = load_body(), truth.body_pose
+        subject = SimpleNamespace(avatar=Plates(body, pose.betas), body=body, betas=pose.betas)
+        baked = avatars.bake(subject, [avatars.Sight(pose)], None)  # type: ignore[arg-type]
+        own, skin = baked.packed()
+        about = {**site.data["avatars"]["0"], **baked.about, "own": "own.bin", "skin": "skin.bin"}
+        page = build.Site("plates", {**site.data, "avatars": {"0": about}}, site.files, {"own.bin": own, "skin.bin": skin})
+        build.write_single(page, tmp_path / "plates.html")
+        clip = site.data["motions"]["shared"]["bow"]
+        angles = np.frombuffer(base64.b64decode(clip["pose"]), "<i2").reshape(-1, 24, 3)[clip["frames"] // 2] / 1e4
+        bowed = BodyPose(np.concatenate([pose.pose[:1], angles[1:]]), pose.betas, pose.transl)
+        where = f"avatar?run=0&camera={view['camera']}&frame={view['frame']}"
+        for words, posed in ((where, pose), (f"{where}&motion=bow&t=0.5", bowed)):
+            rgb, alpha = baked.render(body, truth.camera, posed, (1.0, 1.0, 1.0))
+            seen = drawn(opened(words, tmp_path / "plates.html"))
+            assert 0.2 < np.quantile(alpha[alpha > 0.02], 0.3) < 0.95  # they are half transparent
+            assert psnr(displayed(seen[..., :3] + 1 - seen[..., 3:]), displayed(rgb), alpha > 0.02) > 38
+            assert np.abs(seen[..., 3] - alpha).max() < 0.06
 
 
 def test_painting_turning_and_a_lost_context(opened):

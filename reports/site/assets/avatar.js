@@ -10,6 +10,7 @@ const LIMBS = { // sliders: joints that turn together, about axes of SMPL's rest
   "knees": { 1: [-0.6, 0, 0], 2: [-0.6, 0, 0], 4: [1, 0, 0], 5: [1, 0, 0] },
 };
 const FIELD = 30; // degrees of the free camera
+const FAR = 30; // dB of a price below which the page says so
 const held = { yaw: 20, pitch: 8, zoom: 1, limbs: {}, tints: new Set(), playing: true, t: 0, stepped: null };
 const unpackedAvatars = new Map(); // run -> promise
 
@@ -153,7 +154,9 @@ function price(about, view, motion) {
   const finite = every.map(([p]) => p).filter((p) => typeof p === "number");
   return el("p", { class: "note price" }, "Price of baking, against the method's own drawing by the bench's renderer: ",
     here ? `this view ${words(here)}; ` : "", moved ? `${motion} ${words(moved)}; ` : "",
-    finite.length ? `worst of ${every.length} test views ${Math.min(...finite).toFixed(1)} dB.` : "not measured.");
+    finite.length ? `worst of ${every.length} test views ${Math.min(...finite).toFixed(1)} dB.` : "not measured.",
+    Object.values(about.price).some(([p]) => typeof p === "number" && p < FAR) && el("b", {},
+      " What moves here is not quite what the method draws: part of it depends on the pose or on the direction of view."));
 }
 
 // Joint transforms of the moment: the motion's, or the view's, or the A-pose, with the sliders on top.

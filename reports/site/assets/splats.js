@@ -1,8 +1,10 @@
-// A small WebGL2 renderer of skinned circles. It draws what the bench's own renderer draws (ihbench/render/splat.py):
-// variance (f s / z)² + LOW_PASS px², alpha min(ALPHA_MAX, exp(-d² / 2v)) down to one grey level, back to front.
-// Points are posed in the vertex shader, as a blend of 24 joints' transforms.
+// A small WebGL2 renderer of skinned Gaussians. It draws what the bench's own renderer draws (ihbench/render/splat.py):
+// opaque circles of variance (f s / z)² + LOW_PASS px², or footprints J R Σ Rᵀ Jᵀ + LOW_PASS of general ones; alpha
+// min(largest, opacity exp(-dᵀ Σ⁻¹ d / 2)) down to one grey level; back to front. Gaussians are posed in the vertex
+// shader, means and covariances, by a blend of 24 joints' transforms.
 
-const NEAR = 0.01, LOW_PASS = 0.3, ALPHA_MAX = 0.999, JOINTS = 24, ROW = 1024;
+const NEAR = 0.01, LOW_PASS = 0.3, CLAMP = 0.3, JOINTS = 24, ROW = 1024;
+const ALPHA_MAX = { opaque: 0.999, general: 0.99 };
 
 const VERTEX = `#version 300 es
 precision highp float;
@@ -11,6 +13,8 @@ precision highp sampler2D;
 precision highp usampler2D;
 uniform sampler2D places;    // x y z of the rest pose, and the scale, m
 uniform usampler2D skins;    // four joints, their four weights, colour and label; 8 bits each
+uniform sampler2D shapes;    // of general ones, side by side: xx xy xz yy, and yz zz opacity, m²
+uniform bool general;
 uniform vec4 joints[${3 * JOINTS}];
 uniform vec4 view[3];        // world to camera, row by row
 uniform vec4 lens;           // fx fy cx cy, px
@@ -19,7 +23,8 @@ uniform vec2 size;           // px
 uniform int tinted;          // bit k: label k is painted over; bit 8: surface that a painter made
 in uint number;
 out vec2 offset;
-flat out float variance;
+flat out vec3 inverse;       // of the footprint: xx, xy, yy
+flat out float opacity;
 flat out vec3 colour;
 vec4 bytes(uint four) {
   return vec4(four & 255u, (four >> 8) & 255u, (four >> 16) & 255u, four >> 24);
@@ -31,11 +36,12 @@ void main() {
   uvec4 skin = texelFetch(skins, at, 0);
   vec4 rest = vec4(place.xyz, 1.), weights = bytes(skin.y) / 255.;
   uvec4 bones = uvec4(bytes(skin.x));
-  vec4 world = vec4(0., 0., 0., 1.);
+  mat3x4 blend = mat3x4(0.);  // its columns are the rows of the transform
   for (int k = 0; k < 4; k++) {
     int j = 3 * int(bones[k]);
-    world.xyz += weights[k] * vec3(dot(joints[j], rest), dot(joints[j + 1], rest), dot(joints[j + 2], rest));
+    blend += weights[k] * mat3x4(joints[j], joints[j + 1], joints[j + 2]);
   }
+  vec4 world = vec4(rest * blend, 1.);
   vec3 p = vec3(dot(view[0], world), dot(view[1], world), dot(view[2], world));
   vec4 look = bytes(skin.z);
   int label = int(look.w);
@@ -44,22 +50,44 @@ void main() {
   if ((label & 4) != 0 && (tinted & 256) != 0) part = 4;
   else if ((tinted & (1 << part)) == 0) part = -1;
   if (part >= 0) colour = mix(colour, TINTS[part], .62);
-  variance = place.w * place.w * lens.x * lens.y / (p.z * p.z) + ${LOW_PASS};
-  float reach = sqrt(2. * log(255.) * variance) + .5;
+  vec3 footprint;  // xx, xy, yy, px²
+  if (general) {
+    ivec2 two = ivec2(2 * at.x, at.y);
+    vec4 a = texelFetch(shapes, two, 0), b = texelFetch(shapes, two + ivec2(1, 0), 0);
+    opacity = b.z;
+    mat3 shape = mat3(a.x, a.y, a.z, a.y, a.w, b.x, a.z, b.x, b.y);
+    mat3 turn = transpose(mat3(view[0].xyz, view[1].xyz, view[2].xyz)) * transpose(mat3(blend[0].xyz, blend[1].xyz, blend[2].xyz));
+    vec2 beyond = ${CLAMP} * size / (2. * lens.xy);
+    vec2 along = clamp(p.xy / p.z, -lens.zw / lens.xy - beyond, (size - lens.zw) / lens.xy + beyond);
+    vec3 across = vec3(lens.x, skew, -lens.x * along.x - skew * along.y) / p.z, down = vec3(0., lens.y, -lens.y * along.y) / p.z;
+    mat3 spread = turn * shape * transpose(turn);
+    footprint = vec3(dot(across, spread * across), dot(across, spread * down), dot(down, spread * down));
+  } else {
+    opacity = 1.;
+    float v = place.w * place.w * lens.x * lens.y / (p.z * p.z);
+    footprint = vec3(v, 0., v);
+  }
+  footprint += vec3(${LOW_PASS}, 0., ${LOW_PASS});
+  float area = footprint.x * footprint.z - footprint.y * footprint.y;
+  inverse = vec3(footprint.z, -footprint.y, footprint.x) / area;
+  vec2 reach = sqrt(2. * log(max(255. * opacity, 1.)) * footprint.xz) + .5;
   vec2 corner = vec2(float(gl_VertexID & 1), float(gl_VertexID >> 1)) * 2. - 1.;
   offset = corner * reach;
   vec2 pixel = vec2((lens.x * p.x + skew * p.y) / p.z + lens.z, lens.y * p.y / p.z + lens.w) + offset;
-  gl_Position = p.z > ${NEAR} ? vec4(2. * pixel.x / size.x - 1., 1. - 2. * pixel.y / size.y, 0., 1.) : vec4(2., 2., 2., 1.);
+  gl_Position = p.z > ${NEAR} && area > 0. ? vec4(2. * pixel.x / size.x - 1., 1. - 2. * pixel.y / size.y, 0., 1.) : vec4(2., 2., 2., 1.);
 }`;
 
 const FRAGMENT = `#version 300 es
 precision highp float;
 in vec2 offset;
-flat in float variance;
+flat in vec3 inverse;
+flat in float opacity;
 flat in vec3 colour;
+uniform float largest;
 out vec4 drawn;
 void main() {
-  float alpha = min(${ALPHA_MAX}, exp(-.5 * dot(offset, offset) / variance));
+  vec2 d = offset;
+  float alpha = min(largest, opacity * exp(-.5 * (inverse.x * d.x * d.x + 2. * inverse.y * d.x * d.y + inverse.z * d.y * d.y)));
   if (alpha < 1. / 255.) discard;
   drawn = vec4(colour * alpha, alpha);
 }`;
@@ -85,15 +113,17 @@ class Splats {
     gl.linkProgram(this.program);
     if (!gl.getProgramParameter(this.program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(this.program) ?? "no program");
     gl.useProgram(this.program);
-    this.at = Object.fromEntries(["places", "skins", "joints", "view", "lens", "skew", "size", "tinted"]
+    this.at = Object.fromEntries(["places", "skins", "shapes", "general", "largest", "joints", "view", "lens", "skew", "size", "tinted"]
       .map((name) => [name, gl.getUniformLocation(this.program, name)]));
     gl.uniform1i(this.at.places, 0);
     gl.uniform1i(this.at.skins, 1);
+    gl.uniform1i(this.at.shapes, 2);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
   }
 
-  // `avatar`: count, rest [3n], scales [n], bones [4n], weights [4n], colours [3n], labels [n]
+  // `avatar`: count, rest [3n], bones [4n], weights [4n], colours [3n], labels [n]; scales [n] of circles, or shapes
+  // [8n] of general ones, as the shader has them
   load(avatar) {
     const { gl } = this;
     this.avatar = avatar;
@@ -103,20 +133,25 @@ class Splats {
     const four = (a, b, c, d) => (a | (b << 8) | (c << 16) | (d << 24)) >>> 0;
     for (let i = 0; i < avatar.count; i++) {
       for (let k = 0; k < 3; k++) places[4 * i + k] = avatar.rest[3 * i + k];
-      places[4 * i + 3] = avatar.scales[i];
+      places[4 * i + 3] = avatar.shapes ? 0 : avatar.scales[i];
       skins[4 * i] = four(...avatar.bones.subarray(4 * i, 4 * i + 4));
       skins[4 * i + 1] = four(...avatar.weights.subarray(4 * i, 4 * i + 4));
       skins[4 * i + 2] = four(...avatar.colours.subarray(3 * i, 3 * i + 3), avatar.labels[i]);
     }
-    const texture = (unit, inner, format, kind, data) => {
+    const texture = (unit, inner, format, kind, data, width = ROW) => {
       gl.activeTexture(gl.TEXTURE0 + unit);
       gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
-      gl.texImage2D(gl.TEXTURE_2D, 0, inner, ROW, rows, 0, format, kind, data);
+      gl.texImage2D(gl.TEXTURE_2D, 0, inner, width, rows, 0, format, kind, data);
       gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
       gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
     };
     texture(0, gl.RGBA32F, gl.RGBA, gl.FLOAT, places);
     texture(1, gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT, skins);
+    const shapes = new Float32Array(avatar.shapes ? 8 * ROW * rows : 8 * rows); // never empty: a shader asks for it
+    if (avatar.shapes) shapes.set(avatar.shapes);
+    texture(2, gl.RGBA32F, gl.RGBA, gl.FLOAT, shapes, avatar.shapes ? 2 * ROW : 2);
+    gl.uniform1i(this.at.general, avatar.shapes ? 1 : 0);
+    gl.uniform1f(this.at.largest, avatar.shapes ? ALPHA_MAX.general : ALPHA_MAX.opaque);
     this.order = new Uint32Array(avatar.count);
     this.keys = new Uint16Array(avatar.count);
     this.depths = new Float32Array(avatar.count);
@@ -250,6 +285,13 @@ async function inflated(name) {
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
+// [9] of a unit quaternion without its w, which is not negative
+function turnedBy(x, y, z) {
+  const w = Math.sqrt(Math.max(0, 1 - x * x - y * y - z * z));
+  return [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), 2 * (x * y + w * z), 1 - 2 * (x * x + z * z),
+    2 * (y * z - w * x), 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)];
+}
+
 async function unpacked(about) {
   const [own, skin] = await Promise.all([inflated(about.own), inflated(about.skin)]);
   const n = about.count;
@@ -274,9 +316,23 @@ async function unpacked(about) {
     for (let i = 0; i < n; i++) rest[3 * i + k] = about.low[k] + plane[i] / 65535 * about.size[k];
   }
   const [low, high] = about.scales.map(Math.log);
-  const scales = Float32Array.from(wide(own, 6 * n), (v) => Math.exp(low + v / 65535 * (high - low)));
+  let at = 6 * n; // where the next plane begins
+  const wides = (count) => Array.from({ length: count }, () => { at += 2 * n; return wide(own, at - 2 * n); });
+  const narrows = (count) => Array.from({ length: count }, () => { at += n; return narrow(own, at - n); });
+  const length = (v) => Math.exp(low + v / 65535 * (high - low));
+  let scales = null, shapes = null;
+  if (about.general) {
+    const sizes = wides(3), turns = wides(3), [opacities] = narrows(1);
+    shapes = new Float32Array(8 * n);
+    for (let i = 0; i < n; i++) {
+      const R = turnedBy(...turns.map((plane) => 2 * plane[i] / 65535 - 1));
+      const variances = sizes.map((plane) => length(plane[i]) ** 2);
+      const entry = (r, c) => variances.reduce((sum, v, k) => sum + v * R[3 * r + k] * R[3 * c + k], 0);
+      shapes.set([entry(0, 0), entry(0, 1), entry(0, 2), entry(1, 1), entry(1, 2), entry(2, 2), opacities[i] / 255, 0], 8 * i);
+    }
+  } else scales = Float32Array.from(wides(1)[0], length);
   return {
-    count: n, rest, scales, colours: together([0, 1, 2].map((k) => narrow(own, (8 + k) * n))), labels: narrow(own, 11 * n),
+    count: n, rest, scales, shapes, colours: together(narrows(3)), labels: narrows(1)[0],
     bones: together([0, 1, 2, 3].map((k) => narrow(skin, k * n))), weights: together([4, 5, 6, 7].map((k) => narrow(skin, k * n))),
     joints: about.joints,
   };
