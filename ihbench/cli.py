@@ -11,7 +11,7 @@ from ihbench import registry
 from ihbench.clock import streams
 from ihbench.clock.failures import Failure, explained, one_line
 from ihbench.clock.interruption import interruptible
-from ihbench.commands import COMMANDS
+from ihbench.commands import COMMANDS, module_of
 from ihbench.errors import BadInput
 from ihbench.record.provenance import description, note_command
 from ihbench.scene.method_spec import usable_specs
@@ -74,7 +74,7 @@ def _run(argv: list[str]) -> int:
         return 0
     note_command(argv)
     if argv[0] in COMMANDS:
-        return import_module(f"ihbench.commands.{argv[0].replace('-', '_')}").main(argv[1:])
+        return import_module(module_of(argv[0])).main(argv[1:])
     specs = usable_specs()
     owners = [spec for spec in specs if argv[0] in spec.commands]
     if len(owners) > 1:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
@@ -13,28 +11,12 @@ from ihbench.record import outputs
 from ihbench.record.results import RunResult
 from ihbench.reports.site.frames import Files, OpenScenes, scene_frames
 from ihbench.reports.site.moving import avatars
-from ihbench.reports.site.page import page
+from ihbench.reports.site.page import Site
 from ihbench.reports.site.tables import site_tables
 from ihbench.version import __version__
 
 LARGEST_FILE = 25 * 2**20  # bytes of a single file: browsers open 32 MB by double click, and mail takes 25
-FEWEST_VIEWS = 2
 TITLE = "ihbench: occluded people, rebuilt"
-
-
-@dataclass(frozen=True)
-class Site:
-    """A site before it is written."""
-
-    title: str
-    data: Mapping[str, Any]
-    files: Mapping[str, bytes] = field(default_factory=dict)  # pictures by name
-    carried: Mapping[str, bytes] = field(default_factory=dict)  # what a page must have inside: it may not read files
-
-    def html(self, single: bool = False, live: Mapping[str, Any] | None = None) -> str:
-        """The page; `single` with everything inside, `live` with what a served page must know of its server."""
-        inside = {**self.carried, **(self.files if single else {})}
-        return page(self.title, {**self.data, "live": live}, inside, live is not None)
 
 
 def build(
@@ -107,8 +89,7 @@ def serve(
 ) -> None:
     """Serve the site of what `read` gives on 127.0.0.1, made anew whenever a run has finished, until interrupted.
     Raises `BadInput` for a port that cannot be had."""
-    from ihbench.reports.site.server import Followed
-    from ihbench.reports.site.server import serve as serve_followed
+    from ihbench.reports.site.server import Followed, serve_followed
 
     scenes, progress = OpenScenes(data, body), Progress()
 

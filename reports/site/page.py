@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from base64 import b64encode
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cache
 from hashlib import sha256
 from importlib.resources import files
@@ -75,3 +76,18 @@ def as_json(data: Mapping[str, Any]) -> str:
 
 def _hash(text: str) -> str:
     return b64encode(sha256(text.encode()).digest()).decode("ascii")
+
+
+@dataclass(frozen=True)
+class Site:
+    """A site before it is written."""
+
+    title: str
+    data: Mapping[str, Any]
+    files: Mapping[str, bytes] = field(default_factory=dict)  # pictures by name
+    carried: Mapping[str, bytes] = field(default_factory=dict)  # what a page must have inside: it may not read files
+
+    def html(self, single: bool = False, live: Mapping[str, Any] | None = None) -> str:
+        """The page; `single` with everything inside, `live` with what a served page must know of its server."""
+        inside = {**self.carried, **(self.files if single else {})}
+        return page(self.title, {**self.data, "live": live}, inside, live is not None)

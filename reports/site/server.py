@@ -15,8 +15,7 @@ from typing import Any
 from ihbench.errors import BadInput
 from ihbench.metrics.identity import Identity
 from ihbench.record.results import RunResult
-from ihbench.reports.site.build import Site
-from ihbench.reports.site.page import policy
+from ihbench.reports.site.page import Site, policy
 from ihbench.reports.site.tables import curve_json
 
 HOST = "127.0.0.1"
@@ -105,7 +104,7 @@ def _headline(run: RunResult, identities: Sequence[Identity]) -> Identity | None
     return own[0] if own else None
 
 
-def serve(followed: Followed, port: int, say: Callable[[str], None]) -> None:
+def serve_followed(followed: Followed, port: int, say: Callable[[str], None]) -> None:
     """Serve on the loopback address until interrupted. Raises `BadInput` for a port that cannot be had."""
     try:
         server = ThreadingHTTPServer((HOST, port), handler(followed))

@@ -62,6 +62,8 @@ LIGHT = {
     "plan": ["plan", "--protocol", "zju_occ"],
     "plan help": ["plan", "--help"],
     "run help": ["run", "--help"],
+    "site help": ["site", "--help"],
+    "view help": ["view", "--help"],
     "render help": ["render", "--help"],
     "export help": ["export", "--help"],
 }

@@ -5,7 +5,9 @@ from __future__ import annotations
 import pytest
 from rich.cells import cell_len
 
-from ihbench.reports.general.headline import write
+from ihbench.document.document import Heading, plain_text
+from ihbench.reports.general.headline import headline_section, write
+from ihbench.reports.general.report import HTML
 from tests.reports.fake_runs import fake_run, write_run
 from tests.reports.test_report_verbs import ihbench  # noqa: F401 (a fixture)
 
@@ -26,6 +28,18 @@ def test_methods_come_first_then_what_bounds_them():
     about = lines.index("mean over test views of a, b; not shown: LPIPS*")
     assert lines[about + 1] == "weights are not there"
     assert lines[-1].endswith("--full")
+
+
+def test_a_page_begins_with_the_same_tables():
+    runs = [fake_run("a", psnr=20.0), fake_run("b", psnr=21.0), fake_run("c", status="failed", reason="fell")]
+    heading, note, table = headline_section(runs)
+    assert heading == Heading(2, "Headline")
+    assert "a, b." in plain_text(note.words)
+    assert table.head == ("method", "PSNR ↑", "SSIM ↑", "fit s")
+    assert table.rows[0] == ("ours", "20.50", "0.9000", "10")
+    page = HTML(runs)
+    assert page.index(">Headline<") < page.index(">zju_occ@1, quick profile<")
+    assert headline_section(runs[2:]) == []
 
 
 @pytest.mark.parametrize("width", [10, 40, 61, 80, 200])

@@ -246,9 +246,7 @@ def test_general_gaussians_come_back_from_any_pose():
     found = unpacked(*baked.packed(), baked.about)
     for name, values in found.items():
         assert np.allclose(values, getattr(baked, name), atol=1e-9), name
-    far = np.abs(baked.rest - plates.rest).max(
-        1
-    )  # weights may be those of a neighbouring point
+    far = np.abs(baked.rest - plates.rest).max(1)  # weights may be those of a neighbouring point
     assert np.median(far) < 2e-3
     assert np.quantile(far, 0.95) < 0.02
     factors = avatars._axes(baked.turns) * baked.scales[:, None, :]

@@ -239,7 +239,8 @@ def test_general_gaussians_are_drawn_as_the_bench_draws_them(opened, studio, sit
         baked = avatars.bake(subject, [avatars.Sight(pose)], None)  # type: ignore[arg-type]
         own, skin = baked.packed()
         about = {**site.data["avatars"]["0"], **baked.about, "own": "own.bin", "skin": "skin.bin"}
-        page = build.Site("plates", {**site.data, "avatars": {"0": about}}, site.files, {"own.bin": own, "skin.bin": skin})
+        carried = {"own.bin": own, "skin.bin": skin}
+        page = build.Site("plates", {**site.data, "avatars": {"0": about}}, site.files, carried)
         build.write_single(page, tmp_path / "plates.html")
         clip = site.data["motions"]["shared"]["bow"]
         angles = np.frombuffer(base64.b64decode(clip["pose"]), "<i2").reshape(-1, 24, 3)[clip["frames"] // 2] / 1e4

@@ -10,7 +10,7 @@ import tyro
 
 from ihbench import registry
 from ihbench.commands.options.parse import options
-from ihbench.commands.site import read_runs
+from ihbench.commands.pages.site import read_runs
 from ihbench.config_fields import Within
 
 if TYPE_CHECKING:
