@@ -19,14 +19,15 @@ from ihbench.body.pose import BodyPose
 from ihbench.body.uv import texel_table
 from ihbench.camera import Camera, look_at
 from ihbench.clock.checkpoints import States
+from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.files.pictures import read_rgb
 from ihbench.record.finished_run import FinishedRun
 from ihbench.record.results import read_result, summary
 from ihbench.record.schema import score_lines
 from ihbench.record.store import RunFolder
-from ihbench.reports.site import avatars, build, painted, tables
-from ihbench.reports.site.frames import REGIONS
+from ihbench.reports.site import avatars, build, moving, painted, tables
+from ihbench.reports.site.frames import REGIONS, Files, OpenScenes
 from ihbench.reports.site.server import Followed, handler, own_port
 from ihbench.scene.mask_state import MaskState
 from ihbench.scoring.scoring import Scorer
@@ -270,6 +271,29 @@ def test_colours_of_a_direction_are_those_that_the_cameras_saw():
 def test_what_cannot_be_skinned_says_so():
     subject = SimpleNamespace(avatar=SimpleNamespace(), body=load_body(), betas=np.zeros(10))
     assert "no Gaussians" in avatars.bake(subject, [], None)  # type: ignore[arg-type]
+
+
+def test_one_avatar_does_not_take_the_page_along(results, monkeypatch):
+    def fails(run, *_):
+        raise RuntimeError("a leg fell off\nand rolled away") if run is results[0] else BadInput("not on this body")
+
+    monkeypatch.setattr(moving, "_avatar", fails)
+    made, carried = moving.avatars(results, [], Files(), OpenScenes(None, None), Progress())
+    reasons = [about["reason"] for about in made["avatars"].values()]
+    assert reasons == ["RuntimeError: a leg fell off and rolled away", "not on this body"]
+    assert carried == {}
+
+
+def test_a_licensed_body_is_shown_in_pictures_alone(studio, results, monkeypatch):
+    monkeypatch.setattr(moving, "PROCEDURAL", "another")
+    files = Files()
+    with studio.in_its_world():
+        made, carried = moving.avatars(results[:1], [], files, OpenScenes(None, None), Progress(), share=True)
+    (about,) = made["avatars"].values()
+    assert "--share" in about["reason"]
+    assert carried == {}
+    assert set(about["turntable"]) <= set(files.content)
+    assert len(about["turntable"]) > 3
 
 
 def test_painted_surface_is_what_painted_pixels_show(tmp_path):

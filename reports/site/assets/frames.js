@@ -210,7 +210,7 @@ function scoreTable(scored, wanted, runs) {
   return el("section", {}, el("h3", {}, `Scores of ${wanted}`), el("div", { class: "wide" }, el("table", { class: "scores" },
     el("thead", {}, el("tr", {}, el("th", { scope: "col" }, ""), runs.map((k) => metrics.map((m) =>
       el("th", { scope: "col" }, `${DATA.metrics[m].title} ${DATA.metrics[m].arrow}`,
-        runs.length > 1 && el("small", {}, DATA.runs[k].label)))))),
+        runs.length > 1 && el("small", {}, ` ${DATA.runs[k].label}`)))))),
     el("tbody", {}, regions.map((region) => el("tr", { class: region === first.headline ? "headline" : "" },
       el("th", { scope: "row" }, region), runs.map((k) => metrics.map((m) => cell(k, find(m, region))))))))),
   absences(scored, first));
