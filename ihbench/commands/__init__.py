@@ -22,9 +22,10 @@ COMMANDS = {
     "kernels": "error against milliseconds for the bench's own kernels",
     "train-mini": "train the small diffusion backbone on procedural people; goes on where it stopped",
 }
-PLACES = {"site": "pages.site", "view": "pages.view"}  # modules that are not called as their command
+SHOWING = ("render", "export", "figures", "site", "view")  # their modules lie in `pages`
 
 
 def module_of(command: str) -> str:
     """The dotted name of a command's module."""
-    return f"ihbench.commands.{PLACES.get(command, command.replace('-', '_'))}"
+    room = "pages." if command in SHOWING else ""
+    return f"ihbench.commands.{room}{command.replace('-', '_')}"

@@ -1,1 +1,1 @@
-"""Commands that show runs in a browser."""
+"""Commands that show finished runs: pictures, films, files for other programs, pages for a browser."""
