@@ -73,9 +73,9 @@ def painted(k, yaw, strip, colours):
     return replace(view, image=image)
 
 
-def some_views(strip=STRIP, colours=None, turns=TURNS):
-    colours = two_coloured() if colours is None else colours
-    return [painted(k, yaw, strip if k < 8 else None, colours) for k, yaw in enumerate(turns)]
+def some_views(clear=False):
+    colours = two_coloured()
+    return [painted(k, yaw, None if clear or k >= 8 else STRIP, colours) for k, yaw in enumerate(TURNS)]
 
 
 def set_of(views):
@@ -145,11 +145,11 @@ def test_check_1_step_0_is_gauhuman(training):
         ours, theirs = (a.render(view.camera, view.body_pose) for a in (fit.avatar, gauhuman))
         assert np.abs(ours[0] - theirs[0]).max() < 1e-3
         assert np.abs(ours[1] - theirs[1]).max() < 1e-3
-    assert theirs[1].max() > 0.1
+        assert theirs[1].max() > 0.1
 
 
 def test_check_2_with_nothing_hidden_the_plan_leaves_features_out_and_the_fit_is_gauhumans():
-    clear = set_of(some_views(strip=None))
+    clear = set_of(some_views(clear=True))
     from ihbench.scene.plan import SceneMeasure
 
     measure = SceneMeasure(10, 0, 9, 0.0, 0.9, 0.0, 0.1, 60.0, 90.0, 3.0, 1700.0, {"rule": "none"})
@@ -355,9 +355,10 @@ def test_check_8_dropped_bands_are_learned(trained):
 
 def test_a_band_hides_a_share_of_the_person_from_the_encoder(training):
     fit = a_fit(TINY, training)
+    known, look = fit._targets[0].known, fit.sightings.views[0]
+    person = known.person[..., 0].numpy() > 0
+    band = draw_band(BandConfig(), person, look, 0, 0)
     for step in range(20):
-        known, look = fit._targets[0].known, fit.sightings.views[0]
-        person = known.person[..., 0].numpy() > 0
         band = draw_band(BandConfig(), person, look, 0, step)
         columns = person.sum(0)
         width = columns.max() / columns.sum()
