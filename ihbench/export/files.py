@@ -23,6 +23,7 @@ from ihbench.render.splats import LOW_PASS
 from ihbench.show.motion import Motion, Stand, stand_of, up_axis
 from ihbench.show.subject import Subject
 
+BLUR = "the blur of a training image's pixel"
 CANONICAL = "a_pose"  # in which textures are baked: arms and legs are apart
 
 
@@ -68,6 +69,7 @@ class Exporter:
         """A splat PLY; its comments say what it is. Brush and splat-transform read the last one."""
         cloud, record = self.cloud(body_pose, axes, stand), self.subject.run.record
         note = licence(self.subject.body, holds_body=False)
+        why = BLUR if self.footprint is None else "as asked"
         comments = [
             f"Exported from {GENERATOR}",
             "run: {run} {method} {scene}".format(**facts(record)),
@@ -75,7 +77,7 @@ class Exporter:
             *([f"licence: {note}"] if note else []),
             f"pose: {named}",
             "units: metres",
-            f"widened by: {1000 * self.blur:.3g} mm (standard deviation), the blur of a training image's pixel",
+            *([f"widened by: {1000 * self.blur:.3g} mm (standard deviation), {why}"] if self.blur else []),
             f"axes: {WORDS[axes]}",
             "SplatRenderMode: default",
         ]

@@ -51,11 +51,19 @@ class Subject:
 
     @cached_property
     def pixel(self) -> float | None:
-        """m at the body of a pixel of the training images; None where the data are not at hand."""
+        """m at the body of a pixel of the training images; None where the data are not at hand (`no_pixel`)."""
         try:
             return training_pixel(self.run, self.body)
         except BadInput:
             return None
+
+    @property
+    def no_pixel(self) -> str:
+        """What to say where `pixel` is None."""
+        return (
+            f"{self.run.folder}: its data are not at hand, and with them the size of a training image's pixel; "
+            "gaps between points may show: name --data"
+        )
 
     @property
     def training_frames(self) -> list[int]:

@@ -9,6 +9,7 @@ from PIL import Image
 from ihbench import registry
 from ihbench.body.canonical import canonical_pose
 from ihbench.body.pose import BodyPose
+from ihbench.errors import BadInput
 from ihbench.export.about import licence
 from ihbench.files.splat_ply import read_splat_ply
 from ihbench.record.finished_run import FinishedRun
@@ -85,6 +86,21 @@ def test_a_frames_pose_never_takes_another_person(bench_with_run, tmp_path):
     outcome = bench_with_run("export", folder, "--pose", "0", "--data", tmp_path / "cast")
     assert outcome.status == 2
     assert "holds stand-in v2 seed 1, the run was made on stand-in v2 seed 0" in outcome.err
+
+
+def test_without_the_data_nothing_is_widened_and_a_line_says_so(bench, finished, tmp_path, monkeypatch):
+    def refused(*_):
+        raise BadInput("no data")
+
+    monkeypatch.setattr("ihbench.show.subject.training_pixel", refused)
+    outcome = bench("export", finished.folder, "--out", tmp_path / "a.ply")
+    assert (outcome.status, outcome.err.count("\n")) == (0, 1)
+    assert "its data are not at hand" in outcome.err
+    said = ply_of(tmp_path / "a.ply")[0]
+    assert "units: metres" in said
+    assert not any(line.startswith("widened") for line in said)
+    drawn = bench("render", finished.folder, "--orbit", "1", "--size", "32", "--out", tmp_path / "seen")
+    assert (drawn.status, "its data are not at hand" in drawn.err) == (0, True)
 
 
 def test_a_sequence_is_numbered_and_has_one_origin(bench, finished, tmp_path):

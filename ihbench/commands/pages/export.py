@@ -83,6 +83,8 @@ def main(argv: list[str]) -> int:
     subject = Subject(FinishedRun(chosen.run, chosen.data, chosen.body))
     maker = Exporter(subject, Progress(), chosen.relief, chosen.texture_size, chosen.footprint)
     out = chosen.out or chosen.run / NAMES[chosen.to]
+    if chosen.to.startswith(("ply", "glb-splats")) and chosen.footprint is None and subject.pixel is None:
+        print(f"ihbench: {subject.no_pixel}", file=sys.stderr)
     what = _write(chosen, axes, maker, out)
     said = sys.stderr if is_stream(out) else sys.stdout  # which may be the file itself
     print(f"{what} written to {out}", file=said)

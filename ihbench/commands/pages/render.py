@@ -92,6 +92,9 @@ def main(argv: list[str]) -> int:
         made = film(group, view, r_g_b, chosen.side_by_side, chosen.captions, chosen.sharp)
         if len(made) > MOST_FRAMES:
             raise BadInput(f"{len(made)} frames: expected at most {MOST_FRAMES}; choose a lower --fps")
+        for subject in group if not chosen.sharp else ():
+            if subject.pixel is None:
+                progress.say(f"ihbench: {subject.no_pixel}")
         _write(made, chosen, _target(chosen, group[0].run.folder), progress)
     return 0
 
