@@ -4,6 +4,7 @@ that are not done is told every few seconds."""
 from __future__ import annotations
 
 import json
+import math
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -38,6 +39,9 @@ class Followed:
     results: list[RunResult] = field(default_factory=list)
     fault: str = ""
     _done: tuple[str, ...] | None = None
+    _left_out: list[str] = field(default_factory=list)
+    _read_at: float = -math.inf  # on the monotonic clock
+    _reading: threading.Lock = field(default_factory=threading.Lock)
 
     def follow(self, stop: threading.Event) -> None:
         """Until `stop`."""
@@ -46,28 +50,40 @@ class Followed:
             stop.wait(EVERY)
 
     def look(self) -> None:
-        """Read the folders once; make the site anew where other runs are there, or others are done."""
+        """Read the folders; make the site anew where other runs are there, or others are done."""
+        if not self._refresh(0.0):
+            return
+        results, left_out = self.results, self._left_out
+        done = tuple(sorted(f"{run.folder} {run.status} {_updated(run)}" for run in results))
+        if done == self._done:
+            return
         try:
-            results, left_out = self.read()
-            self.results, self.fault = results, ""
-            done = tuple(sorted(f"{run.folder} {run.status} {_updated(run)}" for run in results))
-            if done == self._done:
-                return
             if self.site is None:
                 self._show(self.make(results, left_out, False))
             self._show(self.make(results, left_out, True))
             self._done = done
-        except (
-            BadInput,
-            OSError,
-        ) as error:  # a folder that is being written or moved: the next look may find it whole
+        except (BadInput, OSError) as error:  # a folder that is being moved: the next look may find it whole
             self.fault = str(error)
+
+    def _refresh(self, after: float) -> bool:
+        """Read the folders unless that was done within `after` s; whether they could be read."""
+        with self._reading:
+            if time.monotonic() - self._read_at >= after:
+                try:
+                    self.results, self._left_out = self.read()
+                    self.fault = ""
+                except (BadInput, OSError) as error:
+                    self.fault = str(error)
+                self._read_at = time.monotonic()
+            return not self.fault
 
     def _show(self, site: Site) -> None:
         self.site, self.version = site, self.version + 1
 
     def state(self) -> dict[str, Any]:
-        """What a page asks for: the site's version, and how far runs have come that are not done."""
+        """What a page asks for: the site's version, and how far runs have come that are not done. While the site is
+        being made, too, which may take minutes."""
+        self._refresh(EVERY)
         return {
             "version": self.version,
             "fault": self.fault,

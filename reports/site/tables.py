@@ -263,13 +263,17 @@ def _stages(run: RunResult) -> list[list[Any]]:
 
 
 def _citations(methods: Sequence[str] | Mapping[str, None]) -> list[str]:
-    """BibTeX of the methods' papers that the bench knows, and how the bench itself is to be named."""
+    """BibTeX of the methods' papers, as far as the bench knows them."""
     specs = {spec.name: spec for spec in usable_specs()}
     entries = []
     for name in methods:
         paper = specs[name].paper if name in specs else None
         if paper is not None:
-            parts = {"title": paper.title, "author": paper.authors, "year": str(paper.year or "")}
+            parts = {
+                "title": paper.title,
+                "author": paper.authors.replace(", ", " and "),
+                "year": str(paper.year or ""),
+            }
             lines = [f"  {key} = {{{value}}}," for key, value in parts.items() if value]
             key = re.sub(r"\W", "", name) + str(paper.year or "")
             entries.append("\n".join((f"@article{{{key},", *lines, "}")))
