@@ -17,13 +17,13 @@ from torch.nn.functional import interpolate
 
 from ihbench.camera import Camera
 from ihbench.diffusion.backbone import Backbone
-from ihbench.diffusion.crops.crop_view import CropView, cut_view
+from ihbench.diffusion.crops.crop_view import EDGE, CropView, cut_view
 from ihbench.diffusion.crops.diffusion_batch import batch_of
 from ihbench.diffusion.crops.part_map import drawn_body, labels_of, part_colours
 from ihbench.diffusion.score_distillation import Prompts, ScoreDistillation, falling_timestep, part_guide
 from ihbench.fit.big_pose.deformation import Posed
 from ihbench.methods.occfusion.avatar import SIDES, OccFusionAvatar, big_pose_camera
-from ihbench.methods.occfusion.hidden import may_hide, visible
+from ihbench.methods.occfusion.hidden import cut_states, visible
 from ihbench.scene.contracts import TrainingSet
 from ihbench.scene.views import LazyViews
 
@@ -114,11 +114,10 @@ class AlphaScore:
     def _view(self, k: int) -> ScoreView:
         training, config, backbone = self.training, self.avatar.config, self.backbone
         view = training.views[k]
-        crop = cut_view(view, k, training.body, self.own.size, backbone.square)
-        seen = crop.crop.cut(visible(view)) > 1e-6
-        hidden = ~seen
+        crop = cut_states(cut_view(view, k, training.body, self.own.size, backbone.square), view, config)
+        hidden = ~(crop.crop.cut(visible(view)) > EDGE)
         if config.hidden == "unknown":
-            hidden &= crop.crop.cut(may_hide(view, config)) > 1e-6
+            hidden &= crop.unknown
         batch = batch_of([crop], backbone.device)
         condition = None
         if self.own.context == "visible":

@@ -22,7 +22,7 @@ from ihbench.diffusion.complete_silhouette import silhouette_finder
 from ihbench.diffusion.crops.crop_view import CropView, cut_view
 from ihbench.diffusion.sampling import inpaint_views
 from ihbench.methods.occfusion.config import OccFusionConfig
-from ihbench.methods.occfusion.hidden import frames_to_paint, may_hide, visible
+from ihbench.methods.occfusion.hidden import cut_states, frames_to_paint, may_hide, visible
 from ihbench.methods.occfusion.painted import Painted
 from ihbench.methods.occfusion.spec import MASKS, MASKS_SAMPLED
 from ihbench.render.zbuffer import rasterize
@@ -53,11 +53,8 @@ class CompleteMasks:
 def asked(view: TrainView, k: int, body: Body, config: OccFusionConfig, size: int, square: bool) -> CropView:
     """The crop as the painter is shown it: the visible person on the background, unknown what may be hidden and lies
     within reach of the posed body."""
-    crop = cut_view(view, k, body, size, square)
-    hidden = crop.crop.cut(may_hide(view, config)) > 1e-6
-    if config.hidden == "not_visible":
-        hidden &= ~crop.person
-    return replace(crop, unknown=hidden & _near(crop.body, config.inpaint.reach))
+    crop = cut_states(cut_view(view, k, body, size, square), view, config)
+    return replace(crop, unknown=crop.unknown & _near(crop.body, config.inpaint.reach))
 
 
 def _near(body: NDArray[np.bool_], reach: float) -> NDArray[np.bool_]:

@@ -65,8 +65,11 @@ class InpaintConfig:
     """Classifier-free guidance of both; 1 is none. None: 7.5 for sd2, 1 for mini."""
     noise: Annotated[float | None, Within(0, 100)] = None
     """Scale of the noise that sampling starts from. None: 1 for sd2, 0 for mini, whose mean answer is the better."""
-    control: Annotated[float, Within(0, 1000)] = 0.3
-    """Of what the ControlNet adds in stage 2, where it guides in guess mode; in stage 0 it is 1."""
+    control: Annotated[float | None, Within(0, 1000)] = None
+    """Scale of what the ControlNet adds in stage 2; in stage 0 it is 1. None: 0.3 for sd2, as released; 1 for mini,
+    which knows a body from the part map alone."""
+    guess: bool | None = None
+    """Whether the ControlNet guides in guess mode in stage 2. None: yes for sd2, as released; no for mini."""
     opaque: Annotated[float, SHARE] = 0.65
     """Stage 2 paints where stage 1's alpha is above this and the person is not visible."""
     reach: Annotated[float, Within(0, 100)] = 0.06
@@ -104,14 +107,16 @@ class Painting:
     steps: int
     guidance: float
     noise: float
+    control: float
+    guess: bool
     mask_prompt: str
     mask_negative: str
     prompt: str
 
 
 OWN = {
-    "mini": Painting(6, 6, 1.0, 0.0, ANYBODY, "", ANYBODY),
-    "sd2": Painting(15, 35, 7.5, 1.0, ONE_PERSON, NOT_ONE_PERSON, TWICE),
+    "mini": Painting(6, 6, 1.0, 0.0, 1.0, False, ANYBODY, "", ANYBODY),
+    "sd2": Painting(15, 35, 7.5, 1.0, 0.3, True, ONE_PERSON, NOT_ONE_PERSON, TWICE),
 }
 
 
@@ -120,7 +125,7 @@ class ScoreConfig:
     """Score distillation on alpha in stage 1."""
 
     weight: Annotated[float | None, WEIGHT] = None
-    """Of the distillation, beside `pixels`. None: 20, as released with Stable Diffusion, for sd2; 5 for mini. 0
+    """Of the distillation, beside `pixels`. None: 20, as released with Stable Diffusion, for sd2; 1 for mini. 0
     leaves it out."""
     every: Annotated[int, Within(1, STEPS)] = 1
     """Steps between two of them, each with so many times the weight."""
@@ -228,7 +233,7 @@ class Score:
 
 
 OWN_SCORE = {
-    "mini": Score(5.0, ANYBODY, ANYBODY, "composite", "visible", 128),
+    "mini": Score(1.0, ANYBODY, ANYBODY, "composite", "visible", 128),
     "sd2": Score(20.0, SILHOUETTE, NO_SILHOUETTE, "silhouette", "nothing", 256),
 }
 

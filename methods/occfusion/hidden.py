@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
+from ihbench.diffusion.crops.crop_view import EDGE, CropView
 from ihbench.methods.occfusion.config import OccFusionConfig
 from ihbench.scene.contracts import MaskState, TrainingSet, TrainView
 from ihbench.scene.spread import spread
@@ -21,6 +24,15 @@ def may_hide(view: TrainView, config: OccFusionConfig) -> NDArray[np.bool_]:
     if config.hidden == "unknown" or not unknown.any():
         return unknown
     return ~visible(view)
+
+
+def cut_states(crop: CropView, view: TrainView, config: OccFusionConfig) -> CropView:
+    """The crop of a view with its person and unknown pixels as the configuration takes them."""
+    hidden = crop.crop.cut(may_hide(view, config)) > EDGE
+    if config.hidden == "unknown":
+        return replace(crop, unknown=hidden)
+    person = crop.crop.cut(visible(view)) >= 0.5
+    return replace(crop, person=person, unknown=hidden & ~person)
 
 
 def frames_to_paint(training: TrainingSet, config: OccFusionConfig) -> list[int]:

@@ -21,7 +21,7 @@ from ihbench.diffusion.crops.person_crop import PersonCrop, person_crop
 from ihbench.diffusion.sampling import inpaint_views
 from ihbench.fit.big_pose.fitting import Colour
 from ihbench.methods.occfusion.avatar import OccFusionAvatar
-from ihbench.methods.occfusion.hidden import frames_to_paint, may_hide, visible
+from ihbench.methods.occfusion.hidden import cut_states, frames_to_paint, visible
 from ihbench.methods.occfusion.painted import Painted
 from ihbench.methods.occfusion.spec import GENERATED, GENERATED_SAMPLED
 from ihbench.scene.contracts import TrainingSet, TrainView
@@ -44,20 +44,18 @@ def canvas_of(view: TrainView, k: int, avatar: OccFusionAvatar, background: Colo
     """The canvas of training view k, [size, size]: an image, what is known as person, what is asked, and the part map
     twice."""
     config = avatar.config
-    crop = cut_to(view, k, avatar.body, half_crop(view, avatar, size))
+    crop = cut_states(cut_to(view, k, avatar.body, half_crop(view, avatar, size)), view, config)
     rgb, alpha = avatar.render(crop.camera, view.body_pose, background)
     drawn = np.rint(255 * rgb).astype(np.uint8)
     opaque = alpha > config.inpaint.opaque
-    seen = crop.crop.cut(visible(view)) >= 0.5
-    hidden = ~seen & (crop.crop.cut(may_hide(view, config)) > 1e-6)
     behind = np.rint(255 * np.array(background)).astype(np.uint8)
-    own = np.where(seen[..., None], crop.image, behind)
-    nothing = np.zeros_like(seen)
+    own = np.where(crop.person[..., None], crop.image, behind)
+    nothing = np.zeros_like(crop.person)
     return replace(
         crop,
         image=np.concatenate([drawn, own], 1),
-        person=np.concatenate([alpha > 0.5, seen], 1),
-        unknown=np.concatenate([nothing, opaque & hidden], 1),
+        person=np.concatenate([alpha > 0.5, crop.person], 1),
+        unknown=np.concatenate([nothing, opaque & crop.unknown], 1),
         parts=np.concatenate([crop.parts, crop.parts], 1),
         cells=np.concatenate([crop.cells, crop.cells], 1),
         crop=replace(crop.crop, width=size),
@@ -81,7 +79,7 @@ def generated_images(
         backbone, canvases, settled.prompt, progress,
         seed=seed, steps=settled.steps, use_parts=True, guidance=settled.guidance, noise_scale=settled.noise,
         batch=max(inpaint.batch // 2, 1), ledger=ledger if ledger.on_disk else None, state=GENERATED_SAMPLED,
-        control_scale=inpaint.control, guess=True,
+        control_scale=settled.control, guess=settled.guess,
     )  # fmt: skip
     out = {}
     for canvas, image in zip(canvases, images, strict=True):

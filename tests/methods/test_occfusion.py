@@ -15,6 +15,7 @@ import torch
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.clock.threads import one_torch_thread
+from ihbench.diffusion.mini.weights import load_mini
 from ihbench.diffusion.score_distillation import falling_timestep
 from ihbench.errors import BadInput, Diverged
 from ihbench.fit.gaussians.density_config import DensityConfig
@@ -110,6 +111,13 @@ def whole(views):
         patch.setattr(occfusion, "load_backbone", lambda config, device: small_one)
         avatar = fitted(training_set(views), ledger)
     return avatar, everything(avatar), ledger, offered
+
+
+def after_stage_1(whole: Any) -> torch.Tensor:
+    """[N, 3] centres."""
+    saved = whole[2].load_state("occfusion-stage1")
+    assert saved is not None
+    return torch.as_tensor(saved[0]["gaussians.means"])
 
 
 # ----------------------------------------------------------------------------------------- check 1: the schedule
@@ -251,11 +259,9 @@ def test_a_composite_is_geometry_only():
 def test_check_3_the_positive_prompt_changes_nothing_the_negative_does(whole, views, small):
     same = fitted(training_set(views), score=replace(TINY.score, positive="skin"))
     assert equal_bits(everything(same), whole[1])
-    other = fitted(
-        training_set(views), refine=replace(TINY.refine, steps=0), score=replace(TINY.score, negative="skin")
-    )
-    first = fitted(training_set(views), refine=replace(TINY.refine, steps=0))
-    assert not equal_bits(everything(other), everything(first))
+    alone = replace(TINY.refine, steps=0)
+    other = fitted(training_set(views), refine=alone, score=replace(TINY.score, negative="skin"))
+    assert not torch.equal(other.gaussians.means, after_stage_1(whole))
 
 
 # -------------------------------------------------------------------------------------- check 4: noise and gradient
@@ -357,7 +363,6 @@ def test_check_6_the_canvas_of_stage_2(views):
     rgb, alpha = avatar.render(canvas.camera, view.body_pose, WHITE)
     assert np.array_equal(canvas.image[left], np.rint(255 * rgb).astype(np.uint8))
     assert not canvas.unknown[left].any()
-    seen = canvas.crop.cut
     half = replace(canvas.crop, width=16)
     seen = half.cut(visible(view)) >= 0.5
     assert np.array_equal(canvas.unknown[right], (alpha > 0.65) & ~seen)
@@ -389,18 +394,22 @@ def iou(one, other) -> float:
     return float((one & other).sum() / (one | other).sum())
 
 
-def test_check_7_complete_masks_know_nothing_but_the_masks(views, backbone):
-    """What the method may see holds no true silhouette; what it makes of it is near to it. What is visible stays."""
-    training = training_set(views)
-    masks = complete_masks(training, TINY, backbone, 0, Ledger(), Progress.silent())
-    assert sorted(masks.painted) == [1, 5]
-    for k, view in enumerate(views):
-        complete = masks.of(k, view)
-        truth = train_view(view.camera, view.body_pose).mask == MaskState.PERSON
-        assert iou(complete, truth) > 0.9, k
-        assert not (visible(view) & ~complete).any()
-        if k % 2 == 0:
-            assert np.array_equal(complete, visible(view)), "nothing stands before it"
+def test_check_7_complete_masks_know_nothing_but_the_masks():
+    """What the method may see holds no true silhouette; what it makes of it is far nearer to it than what is visible,
+    although this person, unlike those that the painter knows, wears nothing. Of a stand-in it is .93 (METHOD.md)."""
+    larger = [
+        train_view(a_camera(0.0, 128), a_pose(1.05 * k, 0.3 * np.sin(k)), slice(56, 70) if k else None, frame=k)
+        for k in range(3)
+    ]
+    masks = complete_masks(training_set(larger), TINY, load_mini(), 0, Ledger(), Progress.silent())
+    assert sorted(masks.painted) == [1, 2]
+    for k in masks.painted:
+        complete, seen = masks.of(k, larger[k]), visible(larger[k])
+        truth = train_view(larger[k].camera, larger[k].body_pose).mask == MaskState.PERSON
+        assert iou(complete, truth) > 0.8 > iou(seen, truth) + 0.4
+        assert not (seen & ~complete).any()
+        assert (truth & ~complete).sum() < 10
+    assert np.array_equal(masks.of(0, larger[0]), visible(larger[0])), "nothing stands before it"
 
 
 def test_without_a_painter_the_body_completes(views):
@@ -460,9 +469,11 @@ def test_check_8_what_the_strip_hides_stays_opaque():
     assert avatar.render(*side)[1][person].mean() > 0.85
 
 
-def test_distillation_and_painting_change_the_avatar(whole, views, small):
+def test_distillation_changes_the_avatar(whole, views, small):
+    alone = replace(TINY.refine, steps=0)
     for changes in ({"score": replace(TINY.score, weight=0.0)}, {"inpaint": InpaintConfig(on=False)}):
-        assert not equal_bits(everything(fitted(training_set(views), **changes)), whole[1])
+        other = fitted(training_set(views), refine=alone, **changes)
+        assert not torch.equal(other.gaussians.means, after_stage_1(whole))
 
 
 # ------------------------------------------------------------------------------------------- killed and gone on with
@@ -669,5 +680,6 @@ def test_profiles_and_the_entry_point():
     score, painting = released.settled_score(), released.inpaint.settled()
     assert (score.weight, score.picture, score.context, score.size) == (20.0, "silhouette", "nothing", 256)
     assert (painting.mask_steps, painting.steps, painting.guidance) == (15, 35, 7.5)
+    assert (painting.control, painting.guess) == (0.3, True)
     assert PAPER.score.guidance == 0
     assert outside_files(replace(PAPER, lpips=0.0, refine=RefineConfig(lpips=0.0))) == []
