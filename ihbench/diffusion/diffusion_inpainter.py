@@ -13,9 +13,10 @@ from ihbench.clock.progress import Progress
 from ihbench.diffusion.backbone import Backbone
 from ihbench.diffusion.crops.crop_view import CropView
 from ihbench.diffusion.inpaint_config import InpaintConfig
-from ihbench.diffusion.personalise import Curve, Personaliser
+from ihbench.diffusion.personalise import Personaliser
 from ihbench.diffusion.sampling import inpaint_views
 from ihbench.diffusion.subject_token import ANYBODY, new_words
+from ihbench.diffusion.tuning import Curve
 
 
 class BackboneChoice(Protocol):

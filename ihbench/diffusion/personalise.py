@@ -6,14 +6,10 @@ Both learn from pixels whose truth is known: M_train = M_vis ⊙ M_rand. The mod
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ihbench.clock.events import Resumed, RolledBack, Warned
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.diffusion.backbone import Backbone, shrink_mask
@@ -22,33 +18,22 @@ from ihbench.diffusion.crops.diffusion_batch import batch_of, by_width, guide_of
 from ihbench.diffusion.crops.push_pull import push_pull
 from ihbench.diffusion.crops.random_mask import SHARES, random_mask
 from ihbench.diffusion.inpaint_config import InpaintConfig
-from ihbench.diffusion.memory import ADVICE, halved
 from ihbench.diffusion.subject_token import ANYBODY, SubjectToken
+from ihbench.diffusion.tuning import Tuning, trainable
 from ihbench.errors import BadInput
 
 TI_SHARES = (0.25, 0.05, 0.05, 0.05, 0.10, 0.50)  # kinds of masks: mostly everything: the word must say it
 SEEN_KEPT = 0.5  # share of the crops of the adaptation that are given what other frames show of what they paint
 BACKGROUND_WEIGHT = 0.15  # of blocks without the person
-GOOD_EVERY = 20  # steps between two copies to roll back to
 TEXT_LR = 1e-5  # of LoRA on the text encoder
 LEAST_FRAMES = 4
 TI_STATE, ADAPT_STATE = "stage2-ti", "stage2-adapt"
 ATTENTION = ["to_q", "to_k", "to_v", "to_out.0"]
 TEXT_ATTENTION = ["q_proj", "k_proj", "v_proj", "out_proj"]
 
-Good = tuple[int, dict[str, Tensor]]  # steps taken, parameters by name
 
-
-@dataclass
-class Curve:
-    """Loss by step, for the record."""
-
-    steps: list[int]
-    losses: list[float]
-
-
-class Personaliser:
-    """Personalises a backbone in place. Resumes from the ledger's states; deterministic by seed."""
+class Personaliser(Tuning):
+    """Personalises a backbone in place."""
 
     def __init__(
         self, backbone: Backbone, views: list[CropView], config: InpaintConfig, seed: int, ledger: Ledger
@@ -56,11 +41,9 @@ class Personaliser:
         shown = [view for view in views if view.person.any()]
         if not shown:
             raise BadInput("personalisation: no frame shows a visible pixel of the person; nothing to learn from")
-        self.backbone, self.views, self.config, self.seed, self.ledger = backbone, shown, config, seed, ledger
-        self.settled = config.settled()
-        self.dtype = backbone.dtype
+        super().__init__(backbone, seed, ledger)
+        self.views, self.config, self.settled = shown, config, config.settled()
         self.token: SubjectToken | None = None
-        self.curves: dict[str, Curve] = {}
 
     @property
     def prompt(self) -> str:
@@ -102,12 +85,12 @@ class Personaliser:
                 added = self._with_lora(backbone.unet, ATTENTION, "unet", ADAPT_STATE)
             else:
                 backbone.unet.requires_grad_(True)
-                added = _trainable(backbone.unet, "unet")
+                added = trainable(backbone.unet, "unet")
             named |= added
             rates |= {name: self.settled.lora_lr for name in added}
         if config.sg:
             backbone.controlnet.requires_grad_(True)
-            added = _trainable(backbone.controlnet, "controlnet")
+            added = trainable(backbone.controlnet, "controlnet")
             named |= added
             rates |= {name: self.settled.control_lr for name in added}
         self._optimise(
@@ -126,7 +109,7 @@ class Personaliser:
         with torch.random.fork_rng(devices=[]):  # peft draws on the CPU
             torch.manual_seed(int(np.random.default_rng((self.seed, *state.encode())).integers(2**62)))
             inject_adapter_in_model(lora, module)
-        return _trainable(module, prefix)
+        return trainable(module, prefix)
 
     def _optimise(
         self,
@@ -140,65 +123,17 @@ class Personaliser:
         use_parts: bool,
         progress: Progress,
     ) -> None:
-        """AdamW on `named`. A non-finite loss stops the stage at the last good state, and the record says so."""
-        groups = [
-            {"params": [named[n] for n in named if rates[n] == rate], "lr": rate, "base": rate, "weight_decay": 0.0}
-            for rate in sorted(set(rates.values()))
-        ]
-        optimizer = torch.optim.AdamW(groups, fused=True)
-        for p in named.values():
-            p.data = p.data.float()  # steps of 1e-5 are lost in half precision
-        curve = self.curves.setdefault(state, Curve([], []))
-        step, batch = self._restored(state, named, optimizer, curve), self.config.batch
-        good: Good = (step, _copies(named))
-        with progress.task(what, steps) as task:
-            task.advance(step)
-            while step < steps:
-                for group in optimizer.param_groups:
-                    group["lr"] = group["base"] * (0.1 + 0.9 * 0.5 * (1 + math.cos(math.pi * step / steps)))
-                optimizer.zero_grad(set_to_none=True)
-                rng = np.random.default_rng((self.seed, *state.encode(), step))
-                try:
-                    loss = self.loss(views, rng, batch, shares, use_parts)
-                    value = float("nan") if loss is None else loss.item()
-                    if loss is not None and loss.requires_grad:
-                        loss.backward()
-                    norm = float(torch.nn.utils.clip_grad_norm_(list(named.values()), 1.0))
-                    fine = loss is None or (math.isfinite(value) and math.isfinite(norm))
-                    if loss is not None and fine:
-                        if step % GOOD_EVERY == 0:
-                            good = (step, _copies(named))  # a finite loss vouches for them
-                        optimizer.step()
-                except (MemoryError, RuntimeError) as error:
-                    line = f"{what}: one crop does not fit into memory; {ADVICE[self.backbone.name]}"
-                    batch = halved(batch, error, line)
-                    self.ledger.event(Warned(f"{what}: out of memory at step {step}, batch now {batch}"))
-                    continue
-                if not fine:
-                    why = f"{what}: loss {value}, gradient {norm} at step {step}"
-                    self._roll_back(named, good, curve, why, state)
-                    break
-                if loss is not None:
-                    curve.steps.append(step)
-                    curve.losses.append(value)
-                step += 1
-                task.advance()
-                due = self.ledger.due_to_save() and step < steps
-                if (due or step == steps) and not _finite(named):  # no loss has seen this last step's outcome yet
-                    self._roll_back(named, good, curve, f"{what}: parameters not finite after step {step - 1}", state)
-                    break
-                if due:
-                    self._save(state, step, named, optimizer, curve)
-        self._save(state, steps, named, optimizer, curve)
-        for p in named.values():
-            p.data = p.data.to(self.dtype)
+        self._tune(
+            state, what, named, rates, steps, self.config.batch,
+            lambda rng, batch: self.loss(views, rng, batch, shares, use_parts), progress,
+        )  # fmt: skip
 
     def loss(
         self, views: list[CropView], rng: np.random.Generator, batch: int, shares: tuple[float, ...], use_parts: bool
     ) -> Tensor | None:
         """Denoising loss over visible pixels hidden on purpose; None when the draw hid none of them."""
         backbone = self.backbone
-        chosen = _draw(views, rng, batch)
+        chosen = draw(views, rng, batch)
         crops = batch_of(chosen, backbone.device)
         made_up = np.stack(
             [random_mask(rng, view.body if view.body.any() else view.person, shares) for view in chosen]
@@ -230,44 +165,6 @@ class Personaliser:
         per_crop = (error * channel_weight(backbone) * weight).sum((1, 2, 3)) / weight.sum((1, 2, 3)).clamp(min=1)
         return (per_crop / latents.shape[1] * timestep_weight(backbone, timesteps)).mean()
 
-    def _roll_back(self, named: dict[str, nn.Parameter], good: Good, curve: Curve, why: str, state: str) -> None:
-        step, values = good
-        kept = sum(n < step for n in curve.steps)
-        del curve.steps[kept:], curve.losses[kept:]
-        with torch.no_grad():
-            for name, p in named.items():
-                p.copy_(values[name])
-        self.ledger.event(RolledBack(state, step, f"{why}; went back to step {step} and stopped there"))
-
-    # --- resume ---
-
-    def _save(
-        self, state: str, step: int, named: dict[str, nn.Parameter], optimizer: torch.optim.Optimizer, curve: Curve
-    ) -> None:
-        tensors: dict[str, Tensor] = {f"p.{name}": p.detach() for name, p in named.items()}
-        if step < (self.config.ti_steps if state == TI_STATE else self.config.lora_steps):
-            for name, p in named.items():
-                tensors |= {f"adam.{name}.{key}": value for key, value in optimizer.state[p].items()}
-        self.ledger.save_state(state, tensors, {"step": step, "steps": curve.steps, "losses": curve.losses})
-
-    def _restored(
-        self, state: str, named: dict[str, nn.Parameter], optimizer: torch.optim.Optimizer, curve: Curve
-    ) -> int:
-        saved = self.ledger.load_state(state)
-        if saved is None:
-            return 0
-        tensors, meta = saved
-        with torch.no_grad():
-            for name, p in named.items():
-                p.copy_(torch.as_tensor(tensors[f"p.{name}"]))
-                if f"adam.{name}.step" in tensors:
-                    keys = ("step", "exp_avg", "exp_avg_sq")
-                    kept = {key: torch.as_tensor(tensors[f"adam.{name}.{key}"]).clone() for key in keys}
-                    optimizer.state[p] = {k: v if k == "step" else v.to(p.device) for k, v in kept.items()}
-        curve.steps[:], curve.losses[:] = list(meta["steps"]), list(meta["losses"])
-        self.ledger.event(Resumed(state, int(meta["step"])))
-        return int(meta["step"])
-
 
 def best_seen(views: list[CropView], share: float) -> list[CropView]:
     """The views in which the least of the body is hidden; at least four, as far as there are so many."""
@@ -292,22 +189,10 @@ def timestep_weight(backbone: Backbone, timesteps: Tensor) -> Tensor:
     return backbone.snr(timesteps).clamp(1, 5)
 
 
-def _draw(views: list[CropView], rng: np.random.Generator, batch: int) -> list[CropView]:
+def draw(views: list[CropView], rng: np.random.Generator, batch: int) -> list[CropView]:
     """A batch of one crop width, in proportion to how many views have it."""
     groups = by_width(views)
     widths = list(groups)
     counts = np.array([len(groups[w]) for w in widths], np.float64)
     numbers = groups[widths[int(rng.choice(len(widths), p=counts / counts.sum()))]]
     return [views[k] for k in rng.choice(numbers, batch, replace=len(numbers) < batch)]
-
-
-def _trainable(module: nn.Module, prefix: str) -> dict[str, nn.Parameter]:
-    return {f"{prefix}.{name}": p for name, p in module.named_parameters() if p.requires_grad}
-
-
-def _copies(named: dict[str, nn.Parameter]) -> dict[str, Tensor]:
-    return {name: p.detach().clone() for name, p in named.items()}
-
-
-def _finite(named: dict[str, nn.Parameter]) -> bool:
-    return all(bool(torch.isfinite(p).all()) for p in named.values())
