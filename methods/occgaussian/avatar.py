@@ -18,9 +18,10 @@ from torch import Tensor
 
 from ihbench.body import Body
 from ihbench.camera import Camera
-from ihbench.fit.big_pose.avatar import DC, REST, VERTEX, Y00, BigPoseAvatar
+from ihbench.fit.big_pose.avatar import VERTEX, BigPoseAvatar
 from ihbench.fit.big_pose.deformation import Posed
 from ihbench.fit.decoded_cache import DecodedCache
+from ihbench.fit.gaussians.harmonics import DC, REST, Y00
 from ihbench.fit.gaussians.skinned_covariance import skinned_covariance
 from ihbench.methods.occgaussian.config import OccGaussianConfig
 from ihbench.methods.occgaussian.decoder import FeatureDecoder

@@ -13,8 +13,9 @@ from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput, Diverged
-from ihbench.fit.big_pose.avatar import DC, VERTEX, Y00
+from ihbench.fit.big_pose.avatar import VERTEX
 from ihbench.fit.gaussians.density_config import DensityConfig
+from ihbench.fit.gaussians.harmonics import DC, Y00
 from ihbench.methods.gauhuman.avatar import GauHumanAvatar
 from ihbench.methods.gauhuman.config import SMOKE as GAUHUMAN
 from ihbench.methods.gauhuman.fitting import GauHumanFit

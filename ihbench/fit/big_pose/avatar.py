@@ -18,16 +18,15 @@ from ihbench.config_fields import read
 from ihbench.fit.avatar_files import read_avatar, write_avatar
 from ihbench.fit.big_pose.config import BigPoseConfig
 from ihbench.fit.big_pose.deformation import Deformation, Frame, Posed
-from ihbench.fit.gaussians.gaussian_set import SHAPES, Gaussians
+from ihbench.fit.gaussians.gaussian_set import Gaussians
+from ihbench.fit.gaussians.harmonics import grey_harmonics, harmonics_in_use
 from ihbench.fit.gaussians.posed import PosedGaussians
 from ihbench.fit.gaussians.skinned_covariance import skinned_covariance
 from ihbench.nets.pose_correction import PoseCorrection
 from ihbench.nets.weight_offsets import WeightOffsets
 from ihbench.render.splat import render_gaussians
 
-Y00 = 0.28209479177387814  # the spherical harmonic of degree 0
 VERTEX = "vertex"  # what each Gaussian carries: the canonical vertex that it takes its weights from
-DC, REST = "sh_dc", "sh_rest"  # attributes: spherical harmonics of degree 0, and above
 
 
 Config = TypeVar("Config", bound=BigPoseConfig)
@@ -47,10 +46,8 @@ class BigPoseAvatar(nn.Module, Generic[Config]):
         self.degree = 0
         self.deformation = Deformation(body).float()
         vertices = self.deformation.vertices
-        n, above = len(vertices), (config.highest_degree + 1) ** 2 - 1
-        colours = {DC: torch.full((n, 1, 3), (config.grey - 0.5) / Y00)}
-        if above:
-            colours[REST] = torch.zeros(n, above, 3)
+        n = len(vertices)
+        colours = grey_harmonics(n, config.grey, config.highest_degree)
         self.gaussians = Gaussians.on(vertices, config.opacity, colours, {VERTEX: torch.arange(n)})
         generator = torch.Generator().manual_seed(seed)
         self.pose_correction = PoseCorrection(generator) if config.pose_network else None
@@ -66,9 +63,7 @@ class BigPoseAvatar(nn.Module, Generic[Config]):
     @property
     def sh(self) -> Tensor:
         """[N, (degree + 1)², 3] the spherical harmonics in use."""
-        attributes = self.gaussians.attributes
-        above = (self.degree + 1) ** 2 - 1
-        return torch.cat([attributes[DC], attributes[REST][:, :above]], 1) if above else attributes[DC]
+        return harmonics_in_use(self.gaussians, self.degree)
 
     def posed(self, frame: Frame, vertex: Tensor | None = None) -> Posed:  # vertex [N] int64
         """The Gaussians in a frame; by the vertices that they carry unless others are given."""
@@ -145,11 +140,7 @@ class BigPoseAvatar(nn.Module, Generic[Config]):
         with saved.put_together():
             tensors = saved.tensors
             avatar = cls(read(cls.config_class, saved.words["config"], "avatar.json: config"), body, seed=0)
-            own = "gaussians.attributes."
-            learned = {name: tensors[own + name] for name in avatar.gaussians.attributes}
-            carried = {VERTEX: tensors[f"gaussians.carried_{VERTEX}"]}
-            means, log_scales, quaternions, opacity_logits = (learned.pop(name) for name in SHAPES)
-            avatar.gaussians = Gaussians(means, log_scales, quaternions, opacity_logits, learned, carried)
+            avatar.gaussians = avatar.gaussians.saved(tensors, "gaussians.")
             avatar.load_state_dict(tensors)
             avatar.degree = min(max(int(saved.words["degree"]), 0), avatar.config.highest_degree)
         return avatar.to(device)

@@ -12,12 +12,13 @@ from torch import Tensor
 from ihbench.camera import Camera
 from ihbench.clock.events import LeftOut
 from ihbench.clock.ledger import Ledger
-from ihbench.fit.big_pose.avatar import DC, REST, BigPoseAvatar
+from ihbench.fit.big_pose.avatar import BigPoseAvatar
 from ihbench.fit.big_pose.config import BigPoseConfig
 from ihbench.fit.big_pose.deformation import Posed
 from ihbench.fit.gaussians.adam import Rate
 from ihbench.fit.gaussians.density import DensityChanged, DensityRules, farther_than
 from ihbench.fit.gaussians.density_config import DensityConfig
+from ihbench.fit.gaussians.harmonics import DC, REST
 from ihbench.fit.gaussians.optimisation import EPS, GaussianOptimisation
 from ihbench.fit.losses import Perceptual, perceptual
 from ihbench.fit.optimisation import ParameterGroup

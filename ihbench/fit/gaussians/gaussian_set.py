@@ -106,6 +106,14 @@ class Gaussians(nn.Module):
         logits = to_logit(points.new_full((n,), opacity))
         return cls(points, spacing(points).log()[:, None].expand(n, 3), quaternions, logits, more, carried)
 
+    def saved(self, tensors: Mapping[str, Tensor], prefix: str = "") -> Gaussians:
+        """A set of these attributes, of any number, from the state dictionary of one whose names begin with `prefix`.
+        Raises `KeyError` for one that is missing."""
+        learned = {name: tensors[f"{prefix}attributes.{name}"] for name in self.attributes}
+        carried = {name: Carried(tensors[prefix + CARRIED + name], of_new) for name, of_new in self.of_new.items()}
+        means, log_scales, quaternions, opacity_logits = (learned.pop(name) for name in SHAPES)
+        return Gaussians(means, log_scales, quaternions, opacity_logits, learned, carried)
+
     def __len__(self) -> int:
         return len(self.attributes["means"])
 
