@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 
 from ihbench.config_fields import STEPS, MultipleOf, Within, check
 from ihbench.diffusion.inpaint_config import PAPER_INPAINT, QUICK_INPAINT, InpaintConfig
+from ihbench.diffusion.weights_named import cached_folders
 from ihbench.errors import BadInput
 from ihbench.fit.precision_name import Precision
 from ihbench.fit.prior_config import PriorConfig
@@ -219,12 +220,9 @@ def outside_files(config: InpaintHumanConfig) -> list[Path]:
     inpaint = config.inpaint
     if not config.paints:
         return []
-    paths = []
-    if inpaint.uses_diffusion:
-        paths += [_folder(name) for name in (inpaint.weights, inpaint.control_weights) if name]
-    if inpaint.silhouette == "sam":
-        paths.append(_folder(inpaint.sam_weights))
-    paths.append(_trunk(config.refine))
+    named = [inpaint.weights, inpaint.control_weights] if inpaint.uses_diffusion else []
+    named += [inpaint.sam_weights] if inpaint.silhouette == "sam" else []
+    paths = [*cached_folders(named), _trunk(config.refine)]
     return [path for path in paths if path is not None]
 
 
@@ -234,13 +232,3 @@ def _trunk(refine: RefineConfig) -> Path | None:
         return None
     trunk = locate(FILES[f"lpips-{refine.lpips_net}"])
     return trunk if isinstance(trunk, Path) else None
-
-
-def _folder(name: str) -> Path | None:
-    """A folder, or the cached snapshot of a hub id; None for what the run will complain of by itself."""
-    from ihbench.diffusion.checkpoint import find_folder
-
-    try:
-        return find_folder(name, "")
-    except BadInput:
-        return None
