@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any, Protocol
-
 import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.diffusion.backbone import Backbone
+from ihbench.diffusion.backbone_choice import load_chosen, look_at_chosen
 from ihbench.diffusion.crops.crop_view import CropView
 from ihbench.diffusion.inpaint_config import InpaintConfig
 from ihbench.diffusion.personalise import Personaliser
@@ -19,47 +17,15 @@ from ihbench.diffusion.subject_token import ANYBODY, new_words
 from ihbench.diffusion.tuning import Curve
 
 
-class BackboneChoice(Protocol):
-    """Which backbone, of which weights: switches that a method's configuration has under `--method.inpaint`."""
-
-    @property
-    def backbone(self) -> str: ...  # "mini" or "sd2"
-    @property
-    def weights(self) -> str: ...
-    @property
-    def control_weights(self) -> str: ...
-    @property
-    def memory_lean(self) -> bool: ...
-
-
-def load_backbone(config: BackboneChoice, device: str) -> Backbone:
+def load_backbone(config: InpaintConfig, device: str) -> Backbone:
     """The backbone that a configuration names. Raises `BadInput` for weights that are missing, wrong or damaged."""
-    if config.backbone == "sd2":
-        from ihbench.diffusion.sd2_weights import load_sd2
-
-        control = config.control_weights or None
-        return load_sd2(config.weights, control, device=device, memory_lean=config.memory_lean)
-    from ihbench.diffusion.mini.weights import load_mini
-
-    return load_mini(Path(config.weights) if config.weights else None, device)
-
-
-def look_at_backbone(config: BackboneChoice) -> Any:
-    """The tokenizer of the backbone. Raises `BadInput` for what `load_backbone` would complain of and a look at the
-    folders can tell, before an hour of fitting."""
-    if config.backbone == "sd2":
-        from ihbench.diffusion.sd2_weights import look_at_sd2
-
-        return look_at_sd2(config.weights, config.control_weights or None).tokenizer
-    from ihbench.diffusion.mini.folder import SHIPPED, check_mini
-    from ihbench.diffusion.mini.weights import mini_tokenizer
-
-    return mini_tokenizer(check_mini(Path(config.weights) if config.weights else SHIPPED)[0])
+    return load_chosen(config, device)
 
 
 def check_backbone(config: InpaintConfig) -> None:
-    """Raises `BadInput` as `look_at_backbone`, and for what personalisation would complain of."""
-    tokenizer = look_at_backbone(config)
+    """Raises `BadInput` for what `load_backbone` and personalisation would complain of and a look at the folders can
+    tell, before an hour of fitting."""
+    tokenizer = look_at_chosen(config)
     if config.ti:
         new_words(tokenizer, config.token, config.settled().vectors, config.backbone)
 

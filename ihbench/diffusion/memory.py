@@ -11,7 +11,7 @@ from ihbench.errors import BadInput
 
 ADVICE = {
     "mini": "close other programs, or use a machine with more memory",
-    "sd2": "use --method.inpaint.memory-lean, or a GPU with more memory",
+    "sd2": "switch memory-lean on, or use a GPU with more memory",
 }
 
 

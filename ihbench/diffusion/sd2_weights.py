@@ -41,7 +41,7 @@ from ihbench.diffusion.text_encoder import TEXT_STEM, unread_text_encoder
 from ihbench.errors import BadInput
 
 STEMS = {"unet": "diffusion_pytorch_model", "vae": "diffusion_pytorch_model", "text_encoder": TEXT_STEM}
-OPTION, CONTROL_OPTION = "--method.inpaint.weights", "--method.inpaint.control-weights"
+SWITCHES = "--method.inpaint."  # what messages call the switches by: before "weights" and "control-weights"
 LAYOUT = (
     "expected Stable Diffusion 2 inpainting in diffusers layout: unet/, vae/, text_encoder/ (config.json and "
     "safetensors in each), tokenizer/, scheduler/scheduler_config.json"
@@ -75,22 +75,22 @@ class LookedAt:
     vae_upcast: bool  # whether the VAE stays in fp32, whatever the rest is in
 
 
-def look_at_sd2(weights: str, control: str | None = None) -> LookedAt:
+def look_at_sd2(weights: str, control: str | None = None, switches: str = SWITCHES) -> LookedAt:
     """The folder or cached hub id `weights`, and the ControlNet of `control` or the UNet in its place, after
     everything was checked that needs no weight to be read. Raises `BadInput`, see `load_sd2`."""
     from diffusers import AutoencoderKL, UNet2DConditionModel
 
-    folder = find_folder(weights, OPTION)
+    folder = find_folder(weights, f"{switches}weights")
     _check_layout(folder)
     configs = {part: read_json(folder / part / "config.json") for part in STEMS}
-    _check_model(folder, configs)
+    _check_model(folder, configs, switches)
     scheduler, tokenizer = _scheduler(folder), _tokenizer(folder, configs["text_encoder"])
     unet_module: Any = empty_module(folder / "unet", lambda: UNet2DConditionModel.from_config(configs["unet"]))
     unet = UnreadModule(unet_module, folder / "unet", STEMS["unet"])
     vae_module: Any = empty_module(folder / "vae", lambda: AutoencoderKL.from_config(configs["vae"]))
     vae = UnreadModule(vae_module, folder / "vae", STEMS["vae"], _vae_name)
     text_encoder = unread_text_encoder(folder / "text_encoder", configs["text_encoder"])
-    controlnet, base_unet = _unread_control(control, unet_module.config, vae_module.config)
+    controlnet, base_unet = _unread_control(control, unet_module.config, vae_module.config, switches)
     upcast = bool(vae_module.config["force_upcast"])
     return LookedAt(folder, unet, vae, text_encoder, controlnet, base_unet, tokenizer, scheduler, upcast)
 
@@ -102,6 +102,7 @@ def load_sd2(
     device: torch.device | str,
     dtype: str = "auto",
     memory_lean: bool = False,
+    switches: str = SWITCHES,
 ) -> Backbone:
     """The backbone of the folder or cached hub id `weights`, frozen, on `device`.
 
@@ -115,9 +116,9 @@ def load_sd2(
     """
     device = torch.device(device)
     number = _number_type(dtype, device)
-    parts = look_at_sd2(weights, control)
+    parts = look_at_sd2(weights, control, switches)
     vae_number = torch.float32 if parts.vae_upcast else number
-    too_small = f"{OPTION} {parts.folder}: {device} has too little free memory for these weights"
+    too_small = f"{switches}weights {parts.folder}: {device} has too little free memory for these weights"
     with said_when_full(f"{too_small}; free some, or use another GPU"):
         # part by part, so that no more than one is in memory twice
         text_encoder = parts.text_encoder.read(device, number)
@@ -191,7 +192,7 @@ def _check_layout(folder: Path) -> None:
         )
 
 
-def _check_model(folder: Path, configs: dict[str, Config]) -> None:
+def _check_model(folder: Path, configs: dict[str, Config], switches: str) -> None:
     """Stable Diffusion 2 inpainting by its layers; widths are only compared with each other."""
     unet, vae, text = configs["unet"], configs["vae"], configs["text_encoder"]
     _check_sd2_unet(folder / "unet" / "config.json", unet)
@@ -201,7 +202,7 @@ def _check_model(folder: Path, configs: dict[str, Config]) -> None:
         (
             channels == 4,
             f"in_channels is 4: this is the base model, not the inpainting one (9); it may be given as "
-            f"{CONTROL_OPTION}",
+            f"{switches}control-weights",
         ),
         (channels != 9, f"in_channels is {channels}, expected 9 (latents, mask, masked latents)"),
     )
@@ -256,7 +257,7 @@ def _vae_name(stored: str) -> str:
 
 
 def _unread_control(
-    control: str | None, unet: Config, vae: Config
+    control: str | None, unet: Config, vae: Config, switches: str
 ) -> tuple[UnreadModule | None, UnreadModule | None]:
     """The ControlNet of `control`, or the UNet to make one from; neither when neither is given. `unet` and `vae` are
     the configurations that it has to go with."""
@@ -264,13 +265,13 @@ def _unread_control(
 
     if not control:
         return None, None
-    folder = find_folder(control, CONTROL_OPTION)
+    folder = find_folder(control, f"{switches}control-weights")
     for part in ("unet", "controlnet"):
         if not (folder / "config.json").is_file() and (folder / part / "config.json").is_file():
             folder = folder / part
     where = folder / "config.json"
     if not where.is_file():
-        raise BadInput(f"{CONTROL_OPTION} {folder}: lacks config.json; {CONTROL_WANTED}")
+        raise BadInput(f"{switches}control-weights {folder}: lacks config.json; {CONTROL_WANTED}")
     config = read_json(where)
     kind = config.get("_class_name")
     if kind == "UNet2DConditionModel":

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from ihbench.diffusion.backbone import Backbone
 from ihbench.errors import BadInput
 
+TOKEN_OPTION = "--method.inpaint.token"
 PHOTO_OF = "a photo of"
 ANYBODY = f"{PHOTO_OF} a person"
 
@@ -17,13 +18,15 @@ ANYBODY = f"{PHOTO_OF} a person"
 class SubjectToken(nn.Module):
     """One or more word vectors in the place of a new word. All other words stay as they are, bit for bit.
 
-    Raises `BadInput` for a word that the tokenizer already has.
+    Raises `BadInput` for a word that the tokenizer already has; `option` is what the user set.
     """
 
-    def __init__(self, backbone: Backbone, word: str, count: int, initial_word: str = "person"):
+    def __init__(
+        self, backbone: Backbone, word: str, count: int, initial_word: str = "person", option: str = TOKEN_OPTION
+    ):
         super().__init__()
         tokenizer, encoder = backbone.tokenizer, backbone.text_encoder
-        self.words = new_words(tokenizer, word, count, backbone.name)
+        self.words = new_words(tokenizer, word, count, backbone.name, option)
         first = initial_ids(tokenizer, initial_word)[0]
         tokenizer.add_tokens(self.words, special_tokens=True)
         ids = tokenizer.convert_tokens_to_ids(self.words)
@@ -51,7 +54,7 @@ class SubjectToken(nn.Module):
         return out
 
 
-def new_words(tokenizer: Any, word: str, count: int, backbone: str) -> list[str]:
+def new_words(tokenizer: Any, word: str, count: int, backbone: str, option: str = TOKEN_OPTION) -> list[str]:
     """The words of V*, one a vector. Raises `BadInput` for a word that the tokenizer of `backbone` already has: one
     of its tokens, or what a prompt would speak of as one ("person", which CLIP lists as "person</w>")."""
     words = [f"{word}-{k}" if k else word for k in range(count)]
@@ -60,7 +63,7 @@ def new_words(tokenizer: Any, word: str, count: int, backbone: str) -> list[str]
         ids = tokenizer(new, add_special_tokens=False).input_ids
         if new in vocabulary or (len(ids) == 1 and ids[0] != tokenizer.unk_token_id):
             raise BadInput(
-                f"--method.inpaint.token {word}: the vocabulary of {backbone} has {new!r} already; choose a word "
+                f"{option} {word}: the vocabulary of {backbone} has {new!r} already; choose a word "
                 f"that no prompt uses, such as <someone>"
             )
     return words

@@ -9,7 +9,7 @@ from ihbench.clock.events import LeftOut
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.diffusion.backbone import Backbone
-from ihbench.diffusion.diffusion_inpainter import load_backbone, look_at_backbone
+from ihbench.diffusion.backbone_choice import load_chosen, look_at_chosen
 from ihbench.errors import BadInput
 from ihbench.methods.occfusion.alpha_score import AlphaScore
 from ihbench.methods.occfusion.avatar import OccFusionAvatar
@@ -61,7 +61,7 @@ class OccFusion:
         inpaint = self.config.inpaint
         if not inpaint.on:
             return None
-        look_at_backbone(inpaint)
+        look_at_chosen(inpaint)
         if inpaint.silhouette == "sam":
             from ihbench.diffusion.complete_silhouette import check_sam
 
@@ -69,7 +69,7 @@ class OccFusion:
         if not self.config.distils and not frames_to_paint(training, self.config):
             ledger.event_once(LeftOut("inpainting", "no training view hides any of a person that it shows"))
             return None
-        return load_backbone(inpaint, device)
+        return load_chosen(inpaint, device)
 
     def load(self, folder: Path, body: Body, device: str = "cpu") -> OccFusionAvatar:
         """Read an avatar written by `OccFusionAvatar.save`."""

@@ -82,7 +82,7 @@ def views():
 @pytest.fixture
 def small(monkeypatch, backbone):
     """The method paints with the small backbone."""
-    monkeypatch.setattr(occfusion, "load_backbone", lambda config, device: backbone)
+    monkeypatch.setattr(occfusion, "load_chosen", lambda config, device: backbone)
 
 
 def fitted(training: TrainingSet, ledger: Ledger | None = None, seed: int = 0, **changes: Any) -> OccFusionAvatar:
@@ -110,7 +110,7 @@ def whole(views):
     ledger = Ledger(on_checkpoint=lambda step, seconds, avatar: offered.append(step))
     with pytest.MonkeyPatch.context() as patch:
         small_one = tiny_backbone()
-        patch.setattr(occfusion, "load_backbone", lambda config, device: small_one)
+        patch.setattr(occfusion, "load_chosen", lambda config, device: small_one)
         avatar = fitted(training_set(views), ledger)
     return avatar, everything(avatar), ledger, offered
 
