@@ -64,7 +64,7 @@ def pruning_alone(config: GtuConfig) -> DensityConfig:
     """Density control once nothing grows any more: what is faint or far too large is pruned."""
     growing = config.density
     return replace(
-        growing, clone="off", split=False, kl_merge=None, after=growing.before - 1,
+        growing, clone="off", split=False, kl_merge=None, after=max(growing.before - 1, 0),
         before=max(config.prune_until, growing.before), largest=config.prune_largest, widest=None,
     )  # fmt: skip
 

@@ -19,7 +19,7 @@ from ihbench.diffusion.crops.seen_surface import SurfaceColours, uv_cells
 from ihbench.diffusion.score_distillation import ScoreDistillation, drawn_timestep, part_guide
 from ihbench.methods.gtu.avatar import GtuAvatar
 from ihbench.methods.gtu.prompts import prompts_of
-from ihbench.methods.gtu.random_views import RandomView, random_view
+from ihbench.methods.gtu.random_views import RandomView, drawn, view_from
 from ihbench.methods.gtu.schedule import noise_range
 from ihbench.render.splats import Screen
 
@@ -70,11 +70,11 @@ class Guesser:
         full = self.backbone.size
         size = full // 2 if k < config.coarse_steps else full
         pose = avatar.poses[frame].detach().cpu().double().numpy()
-        view = random_view(rng, config, k, avatar.body, pose, avatar.betas, size)
+        view = view_from(*drawn(rng, config, k), avatar.body, pose, avatar.betas, size)
         backdrop = self._backdrop(rng).to(device)
         joints = avatar.deformation.joints(view.body_pose.betas)
         rgb, alpha, screen = avatar.draw(
-            torch.from_numpy(view.body_pose.pose).to(joints), joints,
+            torch.from_numpy(np.array(view.body_pose.pose)).to(joints), joints,
             torch.from_numpy(np.array(view.body_pose.transl)).to(joints), view.camera, backdrop,
             ("rgb", "alpha", "screen"),
         )  # fmt: skip

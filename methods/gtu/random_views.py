@@ -50,25 +50,18 @@ def shares(config: GtuConfig, k: int) -> NDArray[np.float64]:
     return out / out.sum()
 
 
-def random_view(
-    rng: np.random.Generator,
-    config: GtuConfig,
-    k: int,  # SDS step
-    body: Body,
-    pose: NDArray[np.float64],  # [24, 3] rad, of a frame
-    betas: NDArray[np.float64],
-    size: int,  # px of the square picture
-) -> RandomView:
-    """A kind by the table, a direction by chance."""
+def drawn(rng: np.random.Generator, config: GtuConfig, k: int) -> tuple[Kind, int, int]:
+    """A kind of view by the table of SDS step k, and an azimuth and elevation in degrees by chance; close-ups are
+    level."""
     kind = KINDS[int(rng.choice(len(KINDS), p=shares(config, k)))]
     azimuth, elevation = int(rng.integers(-180, 180)), int(rng.integers(LOWEST, HIGHEST + 1))
-    return view_from(kind, azimuth, elevation, body, pose, betas, size)
+    return kind, azimuth, 0 if kind in CLOSE else elevation
 
 
 def view_from(
     kind: Kind,
     azimuth: int,  # degrees
-    elevation: int,  # degrees; close-ups are level
+    elevation: int,  # degrees
     body: Body,
     pose: NDArray[np.float64],  # [24, 3] rad
     betas: NDArray[np.float64],
@@ -78,7 +71,6 @@ def view_from(
     where the released .3 m put it."""
     height = body.v_template[:, 1]
     body_pose = BodyPose(posed_for(kind, pose), betas, np.array([0.0, -(height.min() + height.max()) / 2, 0.0]))
-    elevation = 0 if kind in CLOSE else elevation
     camera = camera_at(azimuth, elevation, CLOSE_RADIUS if kind in CLOSE else RADIUS, size)
     if kind in CLOSE:
         camera = _cropped(camera, _part_points(kind, body, body_pose), MARGIN[kind], size)
