@@ -21,6 +21,7 @@ WEIGHT, RATE, SHARE = Within(0, 1e12), Within(0, 1000), Within(0, 1)
 COUNT = Within(0, STEPS)
 TOKEN = "<someone>"
 Context = Literal["none", "seen"]
+Backdrop = Literal["random", "protocol"]
 
 # scene/gaussian_model.py:564-612: 3DGS's growth without any gate
 RELEASED_DENSITY = DensityConfig(
@@ -71,14 +72,15 @@ class Settled:
 
     guidance: float
     context: Context
+    sds_backdrop: Backdrop
     vectors: int
     lr: float
     word_lr: float
 
 
 OWN = {
-    "mini": Settled(guidance=7.5, context="seen", vectors=4, lr=5e-4, word_lr=2e-2),
-    "sd2": Settled(guidance=50.0, context="none", vectors=1, lr=1e-5, word_lr=1e-5),
+    "mini": Settled(guidance=2.0, context="seen", sds_backdrop="protocol", vectors=4, lr=5e-4, word_lr=2e-2),
+    "sd2": Settled(guidance=50.0, context="none", sds_backdrop="random", vectors=1, lr=1e-5, word_lr=1e-5),
 }
 
 
@@ -110,12 +112,13 @@ class GtuConfig:
     close_ups: bool = True
     """Views of head, upper and lower body among the random ones; else whole bodies alone."""
     guidance: Annotated[float | None, Within(1, 1000)] = None
-    """Classifier-free guidance. None: 50 for sd2, as released; 7.5 for mini."""
+    """Classifier-free guidance. None: 50 for sd2, as released; 2 for mini."""
     context: Context | None = None
     """What the inpainting backbone is shown of a random view: nothing, or what the avatar draws of surface that a
     training view showed. None: seen for mini, which was made for that; none for sd2, as released."""
-    sds_backdrop: Literal["random", "protocol"] = "random"
-    """Colour behind the body in random views: the iteration's or its complement, or the protocol's."""
+    sds_backdrop: Backdrop | None = None
+    """Colour behind the body in random views: random, or the protocol's. None: random for sd2, as released; the
+    protocol's for mini, which has only seen people on white."""
     backbone: Literal["mini", "sd2"] = "mini"
     """The diffusion model: the small one that comes with the bench, or your own Stable Diffusion 2 inpainting."""
     weights: str = ""
@@ -201,6 +204,7 @@ class GtuConfig:
                 for given, usual in (
                     (self.guidance, own.guidance),
                     (self.context, own.context),
+                    (self.sds_backdrop, own.sds_backdrop),
                     (identity.vectors, own.vectors),
                     (identity.lr, own.lr),
                     (identity.word_lr, own.word_lr),
@@ -249,7 +253,6 @@ def in_steps(config: GtuConfig, steps: int, photo_steps: int, sds_every: int, fa
         sh_every=max(round(config.sh_every * share), 1),
         position_hold=round(config.position_hold * share),
         position_decay=max(round(config.position_decay * share), 1),
-        lr_scale=config.lr_scale * faster,
         lr_opacity=config.lr_opacity * faster,
         lr_colour=config.lr_colour * faster,
         lr_pose=config.lr_pose * faster,

@@ -92,7 +92,7 @@ class Guesser:
     def _backdrop(self, rng: np.random.Generator) -> Tensor:
         """[3]: uniform, or its complement, which is uniform too; or the protocol's."""
         colour = rng.uniform(size=3)
-        if self.avatar.config.sds_backdrop == "protocol":
+        if self.avatar.config.settled().sds_backdrop == "protocol":
             colour = np.array(self.backdrop)
         return torch.from_numpy(colour).float()
 

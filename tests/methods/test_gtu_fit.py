@@ -19,6 +19,7 @@ from ihbench.methods.gtu.target import grown
 from ihbench.render.zbuffer import vertex_normals
 from ihbench.scene.contracts import MaskState
 from tests.bench.fake_capture import a_camera, a_pose, the_body, train_view
+from tests.diffusion.sd2_miniature import make_miniature
 from tests.diffusion.tiny_diffusion import same, tiny_backbone, weights
 
 from .tiny_fit import SIZE, STRIP, equal_bits, training_set, training_views
@@ -152,6 +153,24 @@ def test_what_training_saw_is_shown_to_the_model():
     guide, condition = blind._shown(view, picture, BODY, 32)
     assert condition is None
     assert not guide[0, 3:].any()
+
+
+def test_with_stable_diffusion_2s_layers(tmp_path):
+    """All of it with the user's kind of weights, in miniature: identity, views of half the size, then whole."""
+    folder = make_miniature(tmp_path)
+    config = replace(
+        TINY, backbone="sd2", weights=str(folder), steps=4, photo_steps=2, sds_every=1, coarse_steps=2, reset_until=0,
+        identity=replace(TINY.identity, steps=1),
+    )  # fmt: skip
+    ledger = Ledger()
+    avatar = Gtu(config).fit(training_set(), device="cpu", seed=0, ledger=ledger, progress=QUIET)
+    assert all(p.isfinite().all() for p in avatar.parameters())
+    (curve,) = events(ledger, "loss_curve")
+    assert np.isfinite(curve["losses"]).all()
+    photos_alone = Gtu(replace(config, sds=False)).fit(
+        training_set(), device="cpu", seed=0, ledger=Ledger(), progress=QUIET
+    )
+    assert not equal_bits(everything(avatar), everything(photos_alone))
 
 
 # ---------------------------------------------------------------------------------------------------- the signature
