@@ -1,0 +1,49 @@
+"""3DGS-Avatar as a registered method (Qian, Wang, Mihajlovic, Geiger, Tang, CVPR 2024)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ihbench.body import Body
+from ihbench.clock.events import Warned
+from ihbench.clock.ledger import Ledger
+from ihbench.clock.progress import Progress
+from ihbench.errors import BadInput
+from ihbench.methods.three_dgs_avatar.avatar import ThreeDgsAvatar
+from ihbench.methods.three_dgs_avatar.config import ThreeDgsAvatarConfig
+from ihbench.methods.three_dgs_avatar.fitting import ThreeDgsAvatarFit
+from ihbench.methods.three_dgs_avatar.frame_tables import TrainingPoses
+from ihbench.scene.contracts import TrainingSet
+
+SAME_BETAS = 1e-3  # a shape coefficient that varies less over the frames is the same
+
+
+class ThreeDgsAvatarMethod:
+    """Deformed and skinned Gaussians fitted to the training views in one go."""
+
+    def __init__(self, config: ThreeDgsAvatarConfig):
+        self.config = config
+
+    def fit(
+        self, training: TrainingSet, *, device: str, seed: int, ledger: Ledger, progress: Progress
+    ) -> ThreeDgsAvatar:
+        """Fit one person. See `scene.contracts.Method`. Raises `BadInput` without a view that shows the person, and
+        `Diverged` also where density control would leave no Gaussian."""
+        if not len(training.views):
+            raise BadInput(f"scene {training.name}: no training view; nothing to fit")
+        with ledger.stage("fit/prepare"):
+            betas = np.array([view.body_pose.betas for view in training.views])
+            if np.ptp(betas, axis=0).max(initial=0) > SAME_BETAS:
+                ledger.event_once(Warned("shape coefficients vary over the frames; the avatar has their mean"))
+            poses = TrainingPoses.of(training.views)
+            avatar = ThreeDgsAvatar(self.config, training.body, betas.mean(0), poses, seed).to(device)
+            fit = ThreeDgsAvatarFit(avatar, training, seed, ledger)
+        with ledger.stage("fit/gaussians"):
+            fit.run(progress)
+        return avatar
+
+    def load(self, folder: Path, body: Body, device: str = "cpu") -> ThreeDgsAvatar:
+        """Read an avatar written by `ThreeDgsAvatar.save`."""
+        return ThreeDgsAvatar.load(folder, body, device)
