@@ -37,8 +37,8 @@ STATIC_DEG = 5.0  # below this no joint moves, and a deformation that depends on
 ONE_SIDE_DEG = 10.0  # a person who turns by less is seen from one direction: colours by direction are one colour
 
 # shares of a step's time, measured with the quick profile
-NON_RIGID_SHARE = 0.3
-DIRECTION_SHARE = 0.01
+NON_RIGID_SHARE = 0.34
+DIRECTION_SHARE = 0.08
 
 
 @dataclass(frozen=True)
@@ -104,6 +104,8 @@ class ThreeDgsAvatarConfig:
     """Weight of the squared difference between the skinning field and the body's weights on the body's surface."""
     skinning_first: Annotated[float, WEIGHT] = 10.0
     """The same in the steps before `gaussians_from`."""
+    surface_samples: Annotated[int, Within(1, 1_000_000)] = 1024
+    """Fresh places on the body's surface for it in each step."""
     isometry: Annotated[float, WEIGHT] = 1.0
     """Weight of the change of distances between neighbours (AIAP)."""
     isometry_shape: Annotated[float, WEIGHT] = 100.0

@@ -37,7 +37,6 @@ from ihbench.scene.contracts import TrainingSet
 from ihbench.scene.views import LazyViews
 
 TARGETS_HELD = 128  # prepared views kept in memory, 1 MB each in the quick profile, 4 MB in paper
-SURFACE_SAMPLES = 1024  # a step, for the skinning field
 NOISE, SURFACE, TURN, WINDOW, WARM_UP = range(1, 6)  # what random numbers are drawn for
 LAST_SHARE = 0.1  # of the networks' step sizes, at the end
 SMALLEST_POSITION_RATE = 0.01  # of the first
@@ -76,7 +75,7 @@ def skinning_weight(config: ThreeDgsAvatarConfig, number: int) -> float:
 
 def skinning_error(avatar: ThreeDgsAvatar, rng: np.random.Generator) -> Tensor:
     """The mean over fresh places on the surface of the squared difference from the body's weights, all joints'."""
-    points, wanted = avatar.star.surface(rng, SURFACE_SAMPLES)
+    points, wanted = avatar.star.surface(rng, avatar.config.surface_samples)
     return (avatar.skinning(avatar.star.normalised(points)) - wanted).square().sum(1).mean()
 
 

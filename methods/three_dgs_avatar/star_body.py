@@ -46,7 +46,8 @@ class StarBody(nn.Module):
     joint_shapes: Tensor  # [24, 3, B] m per unit of each shape coefficient
     center: Tensor  # [3] m, mean of the rest pose's vertices
     reach: Tensor  # [2] m, least and range of its coordinates about that centre, over all axes
-    star_rotations: Tensor  # [24, 3, 3]
+    star_turns: Tensor  # [24, 3, 3] how bones are turned in the star pose: legs about their hips
+    pivots: Tensor  # [24] int64 the joint that each is turned about
 
     def __init__(self, body: Body, betas: NDArray[np.float64]):
         """Raises `BadInput` for shape coefficients that the body does not have."""
@@ -71,9 +72,14 @@ class StarBody(nn.Module):
             ("reach", np.array([(shaped - center).min(), np.ptp(shaped - center)])),
         ):
             self.register_buffer(name, torch.from_numpy(np.array(value, np.float64)), persistent=False)
-        star_rotations = axis_angle_to_matrix(torch.from_numpy(np.array(star.pose)))
-        self.register_buffer("star_rotations", star_rotations, persistent=False)
         self.parents = [int(p) for p in body.parents]
+        pivots = list(range(24))
+        for joint, parent in enumerate(self.parents):
+            if parent >= 0 and not star.pose[joint].any():
+                pivots[joint] = pivots[parent]
+        turns = axis_angle_to_matrix(torch.tensor(star.pose))[pivots]
+        self.register_buffer("star_turns", turns, persistent=False)
+        self.register_buffer("pivots", torch.tensor(pivots), persistent=False)
         self.faces = body.faces
         self._area_up_to = np.cumsum(triangle_areas(vertices[body.faces]))
 
@@ -113,8 +119,14 @@ class StarBody(nn.Module):
             joints = joints + self.joint_shapes @ (betas - self._tensor(self.betas))
         rotations = axis_angle_to_matrix(pose)
         posed = transforms_of_rotations(rotations, joints, self.parents, transl)
-        star = transforms_of_rotations(self.star_rotations, joints, self.parents)
-        return Frame(rotations, self._normalised_joints(joints), posed @ rigid_inverse(star))
+        return Frame(rotations, self._normalised_joints(joints), posed @ self._from_star(joints))
+
+    def _from_star(self, joints: Tensor) -> Tensor:  # [24, 3] m
+        """[24, 4, 4] S⁻¹: from the star pose back to rest. One joint at most is turned on the way to each bone."""
+        back, pivots = self.star_turns.mT, joints[self.pivots]
+        shift = pivots[:, :, None] - back @ pivots[:, :, None]
+        last = joints.new_tensor([0, 0, 0, 1]).expand(24, 1, 4)
+        return torch.cat([torch.cat([back, shift], 2), last], 1)
 
     def _normalised_joints(self, joints: Tensor) -> Tensor:
         least, span = self.reach
@@ -122,12 +134,3 @@ class StarBody(nn.Module):
 
     def _tensor(self, value: NDArray[np.float64]) -> Tensor:
         return torch.from_numpy(np.array(value)).to(self.vertices)
-
-
-def rigid_inverse(
-    transforms: Tensor,  # [..., 4, 4] rotations and translations
-) -> Tensor:
-    """[..., 4, 4] inverses."""
-    turned = transforms[..., :3, :3].mT
-    top = torch.cat([turned, -turned @ transforms[..., :3, 3:]], -1)
-    return torch.cat([top, transforms[..., 3:, :]], -2)

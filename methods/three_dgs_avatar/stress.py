@@ -34,8 +34,9 @@ from ihbench.stress.training import story_of_fit
 TINY = replace(
     SMOKE,
     steps=18,
-    points=1200,
-    warm_up=0,
+    points=800,
+    surface_samples=128,
+    warm_up=60,
     hash_size=8,
     hash_finest=32,
     gaussians_from=2,

@@ -18,18 +18,28 @@ from ihbench.fit.gaussians.gaussian_set import Gaussians
 from ihbench.methods.three_dgs_avatar.config import PAPER, PROFILES, QUICK, SMOKE, leave_out
 from ihbench.methods.three_dgs_avatar.fitting import ThreeDgsAvatarFit, rates, skinning_weight
 from ihbench.methods.three_dgs_avatar.method import ThreeDgsAvatarMethod
-from ihbench.methods.three_dgs_avatar.stress import TINY, fresh
+from ihbench.methods.three_dgs_avatar.stress import CASES, TINY, fresh
 from ihbench.methods.three_dgs_avatar.target import BLACK, Target, image_loss, perceptual_loss, prepare_target
 from ihbench.render.splat import render_gaussians
 from ihbench.scene.contracts import MaskState
 from ihbench.scene.method_spec import method_spec
+from ihbench.stress.run import run_cases
 from tests.bench.fake_capture import WHITE, a_camera, a_pose, the_body, train_view
 
 from .tiny_fit import SIZE, STRIP, equal_bits, training_set, training_views
 from .tiny_gaussians import SavesAt, events, killed_after
 
 BODY = the_body()
-SMALL = replace(TINY, points=700)
+# Gaussians join in step 2, the deformation in 4, poses in 7; the set changes after 9
+SMALL = replace(
+    TINY,
+    points=300,
+    steps=12,
+    non_rigid_from=4,
+    poses_from=7,
+    neighbours_every=4,
+    density=replace(TINY.density, after=6, before=12, every=9),
+)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -264,25 +274,50 @@ def test_check_8_the_majority_of_the_frames_decides(hidden, left):
     assert left_after(hidden)[1] == left
 
 
+SIDE = a_camera(0.0, SIZE), a_pose(0.75)
+
+
+@cache
+def longer(hidden):
+    """A fit to a turning person, with a reset and a change after it, without the strip or with it in every frame but
+    the first; and the views."""
+    strips = [STRIP if hidden and k else None for k in range(6)]
+    views = [train_view(a_camera(0.0, SIZE), a_pose(0.3 * k), strip, frame=k) for k, strip in enumerate(strips)]
+    avatar = fitted(
+        training_set(views),
+        steps=45,
+        points=600,
+        warm_up=150,
+        lr_warm_up=4e-3,
+        lr_feature=0.05,
+        lr_colour=0.02,
+        density=replace(SMALL.density, after=20, before=45, every=14, resets=(28,)),
+    )
+    return avatar, views
+
+
 def test_check_8_the_signature_of_the_strip():
-    """Hidden in every frame but one: few Gaussians are left there and alpha falls; not so without the strip, and not
-    where unknown pixels are ignored."""
-    hidden = [train_view(a_camera(0.0, SIZE), a_pose(0.3 * k), STRIP if k else None, frame=k) for k in range(6)]
-    clear = [train_view(view.camera, view.body_pose, frame=view.frame) for view in hidden]
-    side = a_camera(0.0, SIZE), a_pose(0.75)
-    truth = train_view(*side)
-    person = (truth.mask == MaskState.PERSON) & (np.arange(SIZE) >= STRIP.start) & (np.arange(SIZE) < STRIP.stop)
-    alpha = {}
-    density = replace(SMALL.density, after=8, before=49, every=12, resets=(12,))
-    for name, some, changes in (
-        ("strip", hidden, {}),
-        ("clear", clear, {}),
-        ("ignore", hidden, {"unknown": "ignore"}),
-    ):
-        avatar = fitted(training_set(some), steps=48, density=density, points=1500, **changes)
-        alpha[name] = avatar.render(*side)[1][person].mean()
-    assert alpha["strip"] < 0.5, alpha
-    assert min(alpha["clear"], alpha["ignore"]) > alpha["strip"] + 0.2, alpha
+    """Hardly a Gaussian is left where the strip hides the person in most frames, and nothing is drawn there. Without
+    the strip it is, and beside the strip more than there."""
+    truth = train_view(*SIDE)
+    person, behind = truth.mask == MaskState.PERSON, (np.arange(SIZE) >= STRIP.start) & (np.arange(SIZE) < STRIP.stop)
+    strip, clear = (longer(hidden)[0].render(*SIDE)[1] for hidden in (True, False))
+    assert strip[person & behind].mean() < 0.1
+    assert strip[person & ~behind].mean() > 0.3
+    assert clear[person].mean() > 0.6
+    assert 3 * len(longer(True)[0]) < len(longer(False)[0])
+
+
+def test_a_short_fit_looks_like_the_person():
+    avatar, views = longer(False)
+    before = fresh(avatar.config, training_set(views))
+    for view in views[::2]:
+        person = view.mask == MaskState.PERSON
+        error = [
+            np.square(a.render(view.camera, view.body_pose, frame=view.frame)[0] - view.image / 255)[person].mean()
+            for a in (before, avatar)
+        ]
+        assert error[1] < 0.3 * error[0]
 
 
 # ---------------------------------------------------------------------------------------------------- fitting
@@ -301,25 +336,10 @@ def test_an_unknown_pixel_is_background(views):
     assert not equal_bits(*ignoring)
 
 
-def test_a_short_fit_looks_like_the_person(views):
-    clear = [train_view(view.camera, view.body_pose, frame=view.frame) for view in views]
-    training = training_set(clear)
-    before = fresh(SMALL, training)
-    after = fitted(training, points=1500, steps=40, lr_feature=0.05, lr_colour=0.02,
-                   density=replace(SMALL.density, after=100, before=101))  # fmt: skip
-    for view in clear[::2]:
-        person = view.mask == MaskState.PERSON
-        error = [
-            np.square(a.render(view.camera, view.body_pose, frame=view.frame)[0] - view.image / 255)[person].mean()
-            for a in (before, after)
-        ]
-        assert error[1] < 0.5 * error[0]
-
-
 def test_the_set_changes_and_the_ledger_says_so(views):
     bits, ledger = whole()
     happened = events(ledger)
-    assert [event["step"] for event in happened] == [12]
+    assert [event["step"] for event in happened] == [9]
     assert happened[-1]["count"] == len(bits["gaussians.attributes.means"]) != SMALL.points
     assert bits["gaussians.carried_nearest"].max() < happened[-1]["count"]
     (refined,) = events(ledger, "poses_refined")
@@ -328,15 +348,15 @@ def test_the_set_changes_and_the_ledger_says_so(views):
 
 
 def test_the_same_seed_gives_the_same_bits_and_another_another(views):
-    assert equal_bits(everything(fitted(training_set(views))), whole()[0])
-    some = [everything(fitted(training_set(views), seed, steps=4)) for seed in (0, 1)]
-    assert not equal_bits(*some)
+    some = [everything(fitted(training_set(views), seed, steps=4)) for seed in (0, 0, 1)]
+    assert equal_bits(*some[:2])
+    assert not equal_bits(*some[1:])
 
 
-@pytest.mark.parametrize(("saved", "killed"), [(2, 4), (7, 9), (11, 13), (14, 16)])
+@pytest.mark.parametrize(("saved", "killed"), [(1, 2), (5, 6), (8, 10), (10, 11)])
 def test_a_resumed_fit_equals_an_uninterrupted_one_to_the_bit(views, saved, killed):
-    """Saved before Gaussians join, after the deformation, after poses and before the change, and after it: between
-    two searches for neighbours."""
+    """Saved before Gaussians join, after the deformation, after poses and before the change, and after it: always
+    between two searches for neighbours."""
     training, ledger = training_set(views), SavesAt(saved)
     killed_after(a_fit(training, ledger=ledger), killed)
     resumed = fitted(training, ledger=ledger)
@@ -346,28 +366,30 @@ def test_a_resumed_fit_equals_an_uninterrupted_one_to_the_bit(views, saved, kill
 
 
 def test_ignoring_is_resumed_to_the_bit_too(views):
-    training, ledger = training_set(views), SavesAt(10)
-    killed_after(a_fit(training, ledger=ledger, unknown="ignore"), 11)
-    resumed = fitted(training, ledger=ledger, unknown="ignore")
-    assert equal_bits(everything(fitted(training, unknown="ignore")), everything(resumed))
+    training, ledger = training_set(views), SavesAt(7)
+    some = {"unknown": "ignore", "steps": 10, "points": 200}
+    killed_after(a_fit(training, ledger=ledger, **some), 8)
+    resumed = fitted(training, ledger=ledger, **some)
+    assert resumed.gaussians.carried("seen").any()
+    assert equal_bits(everything(fitted(training, **some)), everything(resumed))
 
 
 def test_the_guard_goes_back_over_a_change_of_the_set(views, monkeypatch):
     """A loss that is not finite once, after a change: the fit goes back to before it, and ends well."""
-    monkeypatch.setattr("ihbench.fit.optimisation.GOOD_EVERY", 11)
+    monkeypatch.setattr("ihbench.fit.optimisation.GOOD_EVERY", 8)
     ledger = Ledger()
     fit = a_fit(training_set(views), ledger=ledger)
     loss, calls = fit._loss, []
 
     def spoiled(k):
         calls.append(k)
-        return loss(k) * (np.nan if len(calls) == 14 else 1)
+        return loss(k) * (np.nan if len(calls) == 11 else 1)
 
     fit._loss = spoiled
     fit.run(Progress.silent())
     (back,) = events(ledger, "rolled_back")
-    assert (back["step"], back["bad_step"]) == (11, 13)
-    assert [event["step"] for event in events(ledger)] == [12, 12]
+    assert (back["step"], back["bad_step"]) == (8, 10)
+    assert [event["step"] for event in events(ledger)] == [9, 9]
     assert all(p.isfinite().all() for p in fit.avatar.parameters())
 
 
@@ -462,14 +484,14 @@ def test_a_nan_pixel_is_a_divergence_and_one_behind_the_occluder_is_nobodys_busi
     image[views[1].mask == MaskState.UNKNOWN] = np.nan
     for unknown in ("background", "ignore"):
         some = (replace(views[1], image=image), views[1])
-        one, other = (fit_of([view], unknown=unknown, steps=4) for view in some)
+        one, other = (fit_of([view], unknown=unknown, steps=2) for view in some)
         assert equal_bits(everything(one), everything(other))
 
 
 def test_pruning_every_gaussian_is_a_divergence(views):
     """No picture of nothing."""
     with pytest.raises(Diverged, match="would prune all of"):
-        fit_of(views, density=replace(SMALL.density, faint=1.0))
+        fit_of(views, density=replace(SMALL.density, faint=1.0, after=1, every=2))
 
 
 def test_shapes_that_differ_by_frame_become_their_mean_and_are_said(views):
@@ -517,3 +539,10 @@ def test_it_is_registered_and_its_profiles_keep_the_released_order():
         for reset in profile.density.resets:
             later = [step for step in range(reset + 1, profile.steps) if profile.density.changes_at(step)]
             assert not later or later[0] - reset >= 50
+
+
+@pytest.mark.parametrize("name", ["rate-1", "rate-100", "rate-1e+30", "one-gaussian"])
+def test_stress_cases_pass(name):
+    (case,) = [case for case in CASES if case.name == f"three-dgs-avatar-{name}"]
+    (outcome,) = run_cases([case])
+    assert outcome.verdict == "passed", outcome.reason

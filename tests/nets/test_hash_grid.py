@@ -39,8 +39,8 @@ def test_the_loops_are_the_tensors(features):
 
 
 def test_gradients_are_those_of_central_differences():
-    grid = a_grid(**SMALL).double()
-    points = torch.rand(6, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64).requires_grad_()
+    grid = a_grid(levels=2, coarsest=2, finest=5, log2_size=4).double()
+    points = torch.rand(5, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64).requires_grad_()
     assert torch.autograd.gradcheck(lambda p, t: twin(grid, p, t), (points, grid.table))
 
 
