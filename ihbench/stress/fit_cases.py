@@ -21,6 +21,7 @@ Config = Any  # of a method: a frozen dataclass
 
 HELPS = "the error of alpha over the views after the fit, over that before: a fit that does not lower it is none"
 STEP = "a step is counted"
+PRUNED = "an opacity of 1 is asked of every Gaussian"
 REFUSED = "it must be refused, and the line must say this"
 
 
@@ -59,7 +60,7 @@ class FitCases:
         after, what = self.story(self.scaled(factor))
         if after is None:
             return Answer(what, "diverged, first bad step")
-        rgb, alpha = after.render(views()[0].camera, views()[0].body_pose)
+        rgb, alpha = after.render(views()[0].camera, views()[0].body_pose, frame=views()[0].frame)
         return Answer(f"finite {bool(np.isfinite(rgb).all() and np.isfinite(alpha).all())}: {what}", "finite True")
 
     def empty_masks(self, config: Config) -> Answer:
@@ -87,10 +88,10 @@ class FitCases:
         return self.case(name, what, function, "at most", HELPS)
 
     def usual(
-        self, normal: Config, unseen: Config, pruned: Config, factors: Sequence[float] = (100.0, 1e4, 1e30)
+        self, normal: Config, unseen: Config, pruned: Config | None, factors: Sequence[float] = (100.0, 1e4, 1e30)
     ) -> list[Case]:
         """Those that each method has: `normal` is its configuration with nothing left out, `unseen` one that leaves
-        hidden pixels alone, `pruned` one under which no Gaussian may stay."""
+        hidden pixels alone, `pruned` one under which no Gaussian may stay, None where that cannot be."""
         step, refused = ("words", STEP), ("words", REFUSED)
         return [
             self.helps("rate-1", "step sizes as they are", lambda: self.ratio(normal)),
@@ -104,10 +105,9 @@ class FitCases:
             self.helps("empty-mask", "two frames without a visible pixel", lambda: self.empty_masks(unseen)),
             self.case("no-view", "no training view", lambda: self.nothing([]), *refused),
             self.case("all-hidden", "views without a visible pixel", lambda: self.nothing(all_unknown()), *refused),
-            self.case(
-                "all-pruned", "an opacity of 1 is asked of every Gaussian",
-                lambda: Answer(self.story(pruned)[1], "would prune all of"), *step,
-            ),
+            *([] if pruned is None else [self.case(
+                "all-pruned", PRUNED, lambda: Answer(self.story(pruned)[1], "would prune all of"), *step,
+            )]),
             self.case("nan-pixel", "a NaN among the person's pixels", lambda: self.bad_pixel(math.nan), *step),
             self.case("inf-pixel", "an infinite person pixel", lambda: self.bad_pixel(math.inf), *step),
             self.helps("nan-hidden", "NaN behind the occluder", self.hidden_bad_pixel),
@@ -118,7 +118,7 @@ def error_of_alpha(avatar: Any, training: TrainingSet) -> float:
     """Mean squared, where it is known whether the person is there."""
     errors = []
     for view in training.views:
-        alpha = avatar.render(view.camera, view.body_pose)[1]
+        alpha = avatar.render(view.camera, view.body_pose, frame=view.frame)[1]
         known = view.mask != MaskState.UNKNOWN
         errors.append(np.square(alpha - (view.mask == MaskState.PERSON))[known])
     return float(np.concatenate(errors).mean())

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ihbench.scene.contracts import Avatar, MaskState, TrainingSet, TrainView
+from ihbench.scene.contracts import MaskState, TrainingSet, TrainView
 from ihbench.stress.drawn_capture import WHITE, a_camera, a_pose, the_body, train_view
 
 SIZE = 48  # px
@@ -65,13 +65,3 @@ def with_bad_hidden_pixels(k: int, value: float) -> TrainingSet:
     image = views()[k].image.astype(np.float32)
     image[views()[k].mask == MaskState.UNKNOWN] = value
     return with_view(k, image=image)
-
-
-def error_of_alpha(avatar: Avatar, training: TrainingSet) -> float:
-    """Mean squared, where it is known whether the person is there."""
-    errors = []
-    for view in training.views:
-        alpha = avatar.render(view.camera, view.body_pose)[1]
-        known = view.mask != MaskState.UNKNOWN
-        errors.append(np.square(alpha - (view.mask == MaskState.PERSON))[known])
-    return float(np.concatenate(errors).mean())

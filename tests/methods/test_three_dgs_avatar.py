@@ -18,7 +18,7 @@ from ihbench.fit.gaussians.gaussian_set import Gaussians
 from ihbench.methods.three_dgs_avatar.config import PAPER, PROFILES, QUICK, SMOKE, leave_out
 from ihbench.methods.three_dgs_avatar.fitting import ThreeDgsAvatarFit, rates, skinning_weight
 from ihbench.methods.three_dgs_avatar.method import ThreeDgsAvatarMethod
-from ihbench.methods.three_dgs_avatar.stress import CASES, TINY, fresh
+from ihbench.methods.three_dgs_avatar.stress import CASES, TINY, start
 from ihbench.methods.three_dgs_avatar.target import BLACK, Target, image_loss, perceptual_loss, prepare_target
 from ihbench.render.splat import render_gaussians
 from ihbench.scene.contracts import MaskState
@@ -54,7 +54,7 @@ def views():
 
 
 def a_fit(training, seed=0, ledger=None, **changes):
-    avatar = fresh(replace(SMALL, **changes), training)
+    avatar = start(replace(SMALL, **changes), training)
     return ThreeDgsAvatarFit(avatar, training, seed, ledger or Ledger())
 
 
@@ -310,7 +310,7 @@ def test_check_8_the_signature_of_the_strip():
 
 def test_a_short_fit_looks_like_the_person():
     avatar, views = longer(False)
-    before = fresh(avatar.config, training_set(views))
+    before = start(avatar.config, training_set(views))
     for view in views[::2]:
         person = view.mask == MaskState.PERSON
         error = [
