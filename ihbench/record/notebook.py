@@ -71,7 +71,8 @@ class RunFrame(pandas.DataFrame):
     def _repr_html_(self) -> str:
         runs = self["digest"].nunique()
         parts = [f"<p><strong>{len(self)} lines of {runs} run{'s' * (runs != 1)}</strong></p>"]
-        for (protocol, profile, data), group in self.groupby(["protocol", "profile", "data"], sort=False):
+        groups: Any = self.groupby(["protocol", "profile", "data"], sort=False)
+        for (protocol, profile, data), group in groups:
             parts.append(f"<p>{escape(f'{protocol}, {profile}, {data}')}: means over views, then over runs</p>")
             parts.append(means_of(group).to_html(float_format="{:.4g}".format, na_rep="—", border=0))
         few = pandas.DataFrame(self).head(LINES).drop(columns=NOT_SHOWN)
@@ -84,15 +85,16 @@ class RunFrame(pandas.DataFrame):
 def means_of(table: pandas.DataFrame) -> pandas.DataFrame:
     """Row × (metric, region): the mean over the views of each run, then over runs; NaN where no view has a number.
     The same in several variants of a metric stands under the name of its identity."""
-    named = table.assign(metric=_told_apart(table))
+    named: Any = table.assign(metric=_told_apart(table))
     by_run = named.groupby(["row", "metric", "region", "digest"], sort=False)["value"].mean()
     means = by_run.groupby(level=["row", "metric", "region"], sort=False).mean().unstack(["metric", "region"])
     by_metric = [(m, r) for m in dict.fromkeys(named["metric"]) for r in dict.fromkeys(named["region"])]
     known = [column for column in by_metric if column in means.columns]
-    return means[known].dropna(axis="columns", how="all")  # type: ignore[return-value]
+    return means[known].dropna(axis="columns", how="all")
 
 
 def _told_apart(table: pandas.DataFrame) -> pandas.Series:
     """The metric's name, or where one name and region has several identities, the identity without its region."""
-    several = table.groupby(["metric", "region"])["identity"].transform("nunique") > 1
-    return table["metric"].where(~several, table["identity"])
+    lines: Any = table
+    several = lines.groupby(["metric", "region"])["identity"].transform("nunique") > 1
+    return lines["metric"].where(~several, lines["identity"])

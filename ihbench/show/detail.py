@@ -57,19 +57,20 @@ def drawn(
     if share > FINER:
         rgb, alpha = avatar.render(camera, body_pose, background, frame)
         return rgb, alpha
-    import cv2
-
     small = tuple(max(8, round(n * share)) for n in (camera.width, camera.height))
     both = (np.asarray(v, np.float32) for v in avatar.render(camera.scaled(*small), body_pose, background, frame))
-    size, square = (camera.width, camera.height), np.ones((3, 3), np.uint8)
-    rgb, alpha = (
-        np.clip(
-            cv2.resize(image, size, interpolation=cv2.INTER_CUBIC),
-            cv2.resize(cv2.erode(image, square), size, interpolation=cv2.INTER_LINEAR),
-            cv2.resize(cv2.dilate(image, square), size, interpolation=cv2.INTER_LINEAR),
-        )
-        if sharp
-        else cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)
-        for image in both
-    )
+    rgb, alpha = (_enlarged(image, camera.width, camera.height, sharp) for image in both)
     return rgb, alpha
+
+
+def _enlarged(image: NDArray[np.float32], width: int, height: int, sharp: bool) -> NDArray[np.float32]:
+    import cv2
+
+    def resized(values: Any, how: int) -> NDArray[np.float32]:
+        return np.asarray(cv2.resize(values, (width, height), interpolation=how), np.float32)
+
+    if not sharp:
+        return resized(image, cv2.INTER_LINEAR)
+    square = np.ones((3, 3), np.uint8)
+    low, high = (resized(change(image, square), cv2.INTER_LINEAR) for change in (cv2.erode, cv2.dilate))
+    return np.clip(resized(image, cv2.INTER_CUBIC), low, high)
