@@ -17,10 +17,10 @@ from ihbench.config_fields import read
 from ihbench.fit.avatar_files import read_avatar, write_avatar
 from ihbench.fit.gaussians.gaussian_set import Carried, Gaussians
 from ihbench.fit.gaussians.harmonics import grey_harmonics, harmonics_in_use
+from ihbench.fit.gaussians.posed import PosedGaussians
 from ihbench.fit.gaussians.skinned_covariance import skinned_covariance
 from ihbench.methods.gtu.config import GtuConfig
 from ihbench.methods.gtu.deformation import Deformation
-from ihbench.render.splat import render_gaussians
 from ihbench.render.zbuffer import vertex_normals
 
 KIND = "gtu"
@@ -74,18 +74,21 @@ class GtuAvatar(nn.Module):
     ) -> tuple:
         """What `render_gaussians` gives of the body in a pose. The harmonics see the direction in the world, so the
         same surface has other directions where the root does not turn; as released."""
+        return self.posed(pose, joints, transl).draw(camera, background, outputs)
+
+    def posed(self, pose: Tensor, joints: Tensor, transl: Tensor) -> PosedGaussians:
+        """As they are drawn; arguments of `draw`."""
         means, turns = self.deformation(self.gaussians.means, pose, joints, transl)
-        return render_gaussians(
-            means,
-            skinned_covariance(self.gaussians.scales, self.gaussians.quaternions, turns),
-            harmonics_in_use(self.gaussians, self.degree),
-            camera,
-            background,
-            opacities=self.gaussians.opacities,
-            sh_degree=self.degree,
-            preset="3dgs",
-            outputs=outputs,
-        )
+        covariances = skinned_covariance(self.gaussians.scales, self.gaussians.quaternions, turns)
+        harmonics = harmonics_in_use(self.gaussians, self.degree)
+        return PosedGaussians(means, covariances, harmonics, None, self.gaussians.opacities, self.degree)
+
+    @torch.no_grad()
+    def posed_gaussians(self, body_pose: BodyPose) -> PosedGaussians:
+        """See `scene.contracts.Avatar`."""
+        pose, transl = (torch.from_numpy(np.array(x)) for x in (body_pose.pose, body_pose.transl))
+        joints = self.deformation.joints(body_pose.betas)
+        return self.posed(pose.to(joints), joints, transl.to(joints))
 
     def render(
         self,
@@ -96,9 +99,7 @@ class GtuAvatar(nn.Module):
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """rgb [H, W, 3] on `background` and alpha [H, W]; see `scene.contracts.Avatar`."""
         with torch.no_grad():
-            pose, transl = (torch.from_numpy(np.array(x)) for x in (body_pose.pose, body_pose.transl))
-            joints = self.deformation.joints(body_pose.betas)
-            rgb, alpha = self.draw(pose.to(joints), joints, transl.to(joints), camera, background)
+            rgb, alpha = self.posed_gaussians(body_pose).draw(camera, background)
         return rgb.clamp(0, 1).cpu().numpy(), alpha.clamp(0, 1).cpu().numpy()
 
     def save(self, folder: Path) -> None:

@@ -7,9 +7,7 @@ without a training view, features are those in memory: all of this is computed o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -17,17 +15,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ihbench.body import Body
-from ihbench.camera import Camera
 from ihbench.fit.big_pose.avatar import VERTEX, BigPoseAvatar
 from ihbench.fit.big_pose.deformation import Posed
 from ihbench.fit.decoded_cache import DecodedCache
 from ihbench.fit.gaussians.harmonics import DC, REST, Y00
+from ihbench.fit.gaussians.posed import PosedGaussians
 from ihbench.fit.gaussians.skinned_covariance import skinned_covariance
 from ihbench.methods.occgaussian.config import OccGaussianConfig
 from ihbench.methods.occgaussian.decoder import FeatureDecoder
 from ihbench.methods.occgaussian.pixel_features import PixelFeatures
 from ihbench.methods.occgaussian.query import Query, make_query, neighbourhood
-from ihbench.render.splat import render_gaussians
 
 DECODER_SEED = 1  # added to the fit's, so that the two networks do not begin with the same numbers
 
@@ -162,31 +159,14 @@ class OccGaussianAvatar(BigPoseAvatar[OccGaussianConfig]):
 
     # --- drawing ---
 
-    def draw(
-        self,
-        posed: Posed,
-        camera: Camera,
-        background: Sequence[float],
-        outputs: Sequence[str] = ("rgb", "alpha"),
-        shown: Shown | None = None,
-    ) -> tuple[Any, ...]:
-        """What `render_gaussians` draws of Gaussians that are posed; with attributes at rest unless others are
-        given."""
+    def drawn(self, posed: Posed, shown: Shown | None = None) -> PosedGaussians:
+        """With attributes at rest unless others are given."""
         if self.decoder is None:
-            return super().draw(posed, camera, background, outputs)
+            return super().drawn(posed)
         shown = self.at_rest() if shown is None else shown
         coefficients = ((shown.colours - 0.5) / Y00)[:, None]
         above = (self.degree + 1) ** 2 - 1
         if above:
             coefficients = torch.cat([coefficients, self.gaussians.attributes[REST][:, :above]], 1)
-        return render_gaussians(
-            posed.means,
-            skinned_covariance(shown.scales, self.gaussians.quaternions, posed.linear),
-            coefficients,
-            camera,
-            background,
-            opacities=shown.opacities,
-            sh_degree=self.degree,
-            preset="3dgs",
-            outputs=outputs,
-        )
+        covariances = skinned_covariance(shown.scales, self.gaussians.quaternions, posed.linear)
+        return PosedGaussians(posed.means, covariances, coefficients, None, shown.opacities, self.degree)

@@ -136,7 +136,7 @@ class OccGaussianFit(BigPoseFit[OccGaussianAvatar]):
         """rgb and alpha of the window; density control sees the screen gradient."""
         avatar, posed = self.avatar, self.avatar.posed(known.frame)
         outputs = ("rgb", "alpha", "screen")
-        rgb, alpha, screen = avatar.draw(posed, known.camera, self.background, outputs, shown)
+        rgb, alpha, screen = avatar.drawn(posed, shown).draw(known.camera, self.background, outputs)
         if torch.is_grad_enabled():
             self.observe(screen, known.width, known.height)
         return rgb, alpha

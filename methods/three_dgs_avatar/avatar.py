@@ -12,11 +12,13 @@ from torch import Tensor, nn
 
 from ihbench.body import Body
 from ihbench.body.pose import BodyPose
+from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera
 from ihbench.config_fields import read
 from ihbench.fit.avatar_files import read_avatar, write_avatar
 from ihbench.fit.decoded_cache import DecodedCache
 from ihbench.fit.gaussians.gaussian_set import SHAPES, Carried, Gaussians
+from ihbench.fit.gaussians.posed import PosedGaussians
 from ihbench.fit.gaussians.skinned_covariance import blended_linear, skinned_covariance
 from ihbench.methods.three_dgs_avatar.colours import FEATURE, LATENT, ColourNetwork, canonical_directions
 from ihbench.methods.three_dgs_avatar.config import ThreeDgsAvatarConfig
@@ -148,6 +150,17 @@ class ThreeDgsAvatar(nn.Module):
         return skinned_covariance(self.gaussians.scales, self.gaussians.quaternions)
 
     # --- drawing ---
+
+    @torch.no_grad()
+    def posed_gaussians(self, body_pose: BodyPose) -> PosedGaussians:
+        """See `scene.contracts.Avatar`. Colours depend on the camera: these are seen from 3 m before the pelvis, with
+        the last latent code."""
+        posed = self.posed(self.star.frame(body_pose))
+        pelvis = self.body.posed_joints(body_pose)[0]
+        before = pelvis + 3 * axis_angle_to_matrix(body_pose.pose[0])[:, 2]
+        camera = Camera(np.eye(3), np.eye(3), -before, 1, 1)  # its place is all that matters
+        colours = self.colours_of(posed, camera, None)
+        return PosedGaussians(posed.means, posed.covariances, colours, None, self.gaussians.opacities)
 
     @torch.no_grad()
     def render(

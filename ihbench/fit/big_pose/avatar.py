@@ -24,7 +24,6 @@ from ihbench.fit.gaussians.posed import PosedGaussians
 from ihbench.fit.gaussians.skinned_covariance import skinned_covariance
 from ihbench.nets.pose_correction import PoseCorrection
 from ihbench.nets.weight_offsets import WeightOffsets
-from ihbench.render.splat import render_gaussians
 
 VERTEX = "vertex"  # what each Gaussian carries: the canonical vertex that it takes its weights from
 
@@ -80,6 +79,11 @@ class BigPoseAvatar(nn.Module, Generic[Config]):
         """[N, 3, 3] m², world."""
         return skinned_covariance(self.gaussians.scales, self.gaussians.quaternions, posed.linear)
 
+    def drawn(self, posed: Posed) -> PosedGaussians:
+        """Gaussians that are posed, with the attributes that are drawn."""
+        opacities = self.gaussians.opacities
+        return PosedGaussians(posed.means, self.covariances(posed), self.sh, None, opacities, self.degree)
+
     def draw(
         self,
         posed: Posed,
@@ -88,17 +92,7 @@ class BigPoseAvatar(nn.Module, Generic[Config]):
         outputs: Sequence[str] = ("rgb", "alpha"),
     ) -> tuple[Any, ...]:
         """What `render_gaussians` draws of Gaussians that are posed."""
-        return render_gaussians(
-            posed.means,
-            self.covariances(posed),
-            self.sh,
-            camera,
-            background,
-            opacities=self.gaussians.opacities,
-            sh_degree=self.degree,
-            preset="3dgs",
-            outputs=outputs,
-        )
+        return self.drawn(posed).draw(camera, background, outputs)
 
     def refresh_vertices(self) -> None:
         """Let each Gaussian carry the vertex that is nearest to it now."""
@@ -106,11 +100,10 @@ class BigPoseAvatar(nn.Module, Generic[Config]):
 
     @torch.no_grad()
     def posed_gaussians(self, body_pose: BodyPose) -> PosedGaussians:
-        """As they are drawn; see `scene.contracts.Avatar`."""
+        """See `scene.contracts.Avatar`. As released, the pose network corrects any pose, also those
+        that nobody trained on."""
         vertex = self.deformation.nearest(self.gaussians.means)
-        posed = self.posed(self.deformation.frame(body_pose), vertex)
-        opacities = self.gaussians.opacities
-        return PosedGaussians(posed.means, self.covariances(posed), self.sh, None, opacities, self.degree)
+        return self.drawn(self.posed(self.deformation.frame(body_pose), vertex))
 
     def render(
         self,
@@ -119,11 +112,9 @@ class BigPoseAvatar(nn.Module, Generic[Config]):
         background: tuple[float, float, float] = (1.0, 1.0, 1.0),
         frame: int | None = None,  # nothing is learned for single frames
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """rgb [H, W, 3] on `background` and alpha [H, W]; see `scene.contracts.Avatar`. As released, the pose network
-        corrects any pose, also those that nobody trained on."""
+        """rgb [H, W, 3] on `background` and alpha [H, W]; see `scene.contracts.Avatar`."""
         with torch.no_grad():
-            vertex = self.deformation.nearest(self.gaussians.means)
-            rgb, alpha = self.draw(self.posed(self.deformation.frame(body_pose), vertex), camera, background)
+            rgb, alpha = self.posed_gaussians(body_pose).draw(camera, background)
         return rgb.clamp(0, 1).cpu().numpy(), alpha.clamp(0, 1).cpu().numpy()
 
     def save(self, folder: Path) -> None:

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from torch import Tensor
+
+from ihbench.camera import Camera
+from ihbench.render.splat import render_gaussians
 
 
 @dataclass(frozen=True)
@@ -17,3 +22,20 @@ class PosedGaussians:
     quaternions: Tensor | None = None  # [N, 4] w x y z, of scales [N, 3]
     opacities: Tensor | None = None  # [N] 0..1; None: opaque
     sh_degree: int | None = None  # None: `colors` are colours
+
+    def draw(
+        self, camera: Camera, background: Sequence[float] | Tensor, outputs: Sequence[str] = ("rgb", "alpha")
+    ) -> tuple[Any, ...]:
+        """What `render_gaussians` gives of them by the rules of 3DGS."""
+        return render_gaussians(
+            self.means,
+            self.scales,
+            self.colors,
+            camera,
+            background,
+            quaternions=self.quaternions,
+            opacities=self.opacities,
+            sh_degree=self.sh_degree,
+            preset="3dgs",
+            outputs=outputs,
+        )
