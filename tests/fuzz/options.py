@@ -235,6 +235,9 @@ def _good_words(option: Option, world: World) -> list[str]:
         ("report", "lint"): [world.path("file.txt")],
         ("export",): [run],
         ("render",): [run, "--orbit", "2", "--size", "16"],
+        ("figures",): ["visual", run, "--views", "1", "--out", world.path("home") / "figures"],
+        ("site",): [run, "--out", world.path("home") / "site"],
+        ("view",): [run],
         ("ceiling",): [run],
         ("train-mini",): ["--out", world.path("home") / "mini"],
         ("protocol", "show"): ["zju_occ"],
@@ -280,6 +283,7 @@ def cut_short() -> Iterator[None]:
         "ihbench.methods.inpainthuman.studies.paint_table.paint_scene",
         "ihbench.diffusion.crops.crop_dataset.CropDataset.make",
         "ihbench.datasets.standin.photograph.photograph",
+        "ihbench.reports.site.server.serve_followed",
     )
     with contextlib.ExitStack() as stack:
         for place in places:
