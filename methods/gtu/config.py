@@ -197,20 +197,9 @@ class GtuConfig:
 
     def settled(self) -> Settled:
         """The values that are in force, with the backbone's own in the place of None."""
-        own, identity = OWN[self.backbone], self.identity
-        return Settled(
-            *(
-                usual if given is None else given
-                for given, usual in (
-                    (self.guidance, own.guidance),
-                    (self.context, own.context),
-                    (self.sds_backdrop, own.sds_backdrop),
-                    (identity.vectors, own.vectors),
-                    (identity.lr, own.lr),
-                    (identity.word_lr, own.word_lr),
-                )
-            )
-        )
+        asked = vars(self) | vars(self.identity)
+        own = OWN[self.backbone]
+        return replace(own, **{name: asked[name] for name in vars(own) if asked[name] is not None})
 
     def __post_init__(self) -> None:
         check(self, "--method.")

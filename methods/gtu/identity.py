@@ -125,7 +125,7 @@ def _soft(mask: NDArray[np.bool_], by: int) -> NDArray[np.float32]:
         return mask.astype(np.float32)
     side = by | 1
     inner = cv2.erode(mask.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)))
-    return cv2.GaussianBlur(inner.astype(np.float32), (side, side), 0)
+    return np.asarray(cv2.GaussianBlur(inner.astype(np.float32), (side, side), 0), np.float32)
 
 
 def _pasted(picture: Tensor, size: int, side: int, x: int, y: int, how: str) -> Tensor:
