@@ -55,11 +55,16 @@ INDEX = "runs.sqlite"  # beside the run folders
 DAMAGED_NAME = re.compile(r"run\.json\.damaged(-\d+)?")
 KILLED = "its process ended without a word: it was killed, or the machine went down"
 # what the bench writes into a run folder: whatever else lies there is the user's, and stays
+EXPORTED = {  # of `ihbench export` and `render`, unless they are told otherwise
+    "avatar.ply", "avatar.glb", "avatar_splats.glb", "avatar_texture.png", "avatar_motion.npz", "render.webp",
+}  # fmt: skip
+SEQUENCE = "avatar_ply"  # folder of an exported sequence
 WRITTEN = {
     "": {
         "run.json", "scores.jsonl", "calibration.jsonl", "curve.jsonl", "traceback.txt", "contact_sheet.png",
-        "avatar.ply", *ARTIFACTS,
+        *EXPORTED, *ARTIFACTS,
     },
+    SEQUENCE: {".ply"},
     "avatar": {".safetensors", ".json", ".npz", ".npy", ".pt", ".pth", ".bin"},
     "checkpoints": {".safetensors"},
     "presets": {".jsonl"},
@@ -432,7 +437,8 @@ def remove_run(path: Path) -> Path | None:
 
 def is_record(path: Path) -> bool:
     """Whether what has this path in a run folder belongs to the run; an exported avatar does not."""
-    return (path.name != "avatar.ply" and _is_ours(path)) or path.as_posix() in (
+    exported = path.as_posix() in EXPORTED or path.parts[0] == SEQUENCE
+    return (not exported and _is_ours(path)) or path.as_posix() in (
         LOCK,
         LOCK + locks.OWNER,
         LOCK + locks.CLAIM,

@@ -52,8 +52,9 @@ class Subject:
     @cached_property
     def pixel(self) -> float | None:
         """m at the body of a pixel of the training images; None where the data are not at hand (`no_pixel`)."""
+        body = self.body  # a run without an avatar has no body either, which is not for want of data
         try:
-            return training_pixel(self.run, self.body)
+            return training_pixel(self.run, body)
         except BadInput:
             return None
 

@@ -29,7 +29,7 @@ ROOT = Path(__file__).resolve().parents[2]
 ROOMS = ("ihbench", *registry.ROOMS)
 # of what is left out, the modules that code with numbers may use: they say, find, measure or show
 HARMLESS = {
-    *("api", "errors", "registry", "record.provenance", "scoring.contact_sheet"),
+    *("api", "errors", "registry", "record.notebook", "record.provenance", "scoring.contact_sheet"),
     *(f"clock.{name}" for name in ("failures", "streams", "progress", "machine", "threads")),
 }
 
