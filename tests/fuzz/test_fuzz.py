@@ -5,7 +5,7 @@ import pytest
 from tests.fuzz import options
 from tests.fuzz.__main__ import faults
 
-SAMPLE = {"readers": 330, "options": 150}  # for run folders see tests/record/test_damaged_runs.py
+SAMPLE = {"readers": 330, "options": 120}  # for run folders see tests/record/test_damaged_runs.py
 
 
 @pytest.mark.parametrize("kind", SAMPLE)
