@@ -92,7 +92,8 @@ class FitCases:
     ) -> list[Case]:
         """Those that each method has: `normal` is its configuration with nothing left out, `unseen` one that leaves
         hidden pixels alone, `pruned` one under which no Gaussian may stay, None where that cannot be."""
-        step, refused = ("words", STEP), ("words", REFUSED)
+        step: tuple[Unit, str] = ("words", STEP)
+        refused: tuple[Unit, str] = ("words", REFUSED)
         return [
             self.helps("rate-1", "step sizes as they are", lambda: self.ratio(normal)),
             *(

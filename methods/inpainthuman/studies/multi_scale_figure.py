@@ -109,7 +109,7 @@ def outlined(picture: NDArray[np.uint8], region: NDArray[np.uint8]) -> NDArray[n
     out = picture.copy()
     for colour in (HIDDEN, NEVER_SEEN):
         inside = (region == np.array(colour, np.uint8)).all(-1)
-        out[inside & ~binary_erosion(inside, iterations=2)] = colour
+        out[inside & np.logical_not(binary_erosion(inside, iterations=2))] = colour
     return out
 
 
