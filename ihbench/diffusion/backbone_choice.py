@@ -1,11 +1,16 @@
-"""The backbone that a method's configuration chooses, looked at or loaded."""
+"""The backbone that a method's configuration chooses: its folders, looked at or loaded. Imports nothing heavy by
+itself: plans and identities of runs ask it."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
-from ihbench.diffusion.backbone import Backbone
+from ihbench.errors import BadInput
+
+if TYPE_CHECKING:
+    from ihbench.diffusion.backbone import Backbone
 
 SWITCHES = "--method.inpaint."  # where most methods have them
 
@@ -52,3 +57,18 @@ def look_at_chosen(choice: BackboneChoice, switches: str = SWITCHES) -> Any:
     from ihbench.diffusion.mini.weights import mini_tokenizer
 
     return mini_tokenizer(check_mini(Path(choice.weights) if choice.weights else SHIPPED)[0])
+
+
+def cached_folders(names: Iterable[str]) -> list[Path]:
+    """A folder, or the cached snapshot of a hub id, for each name. An empty name, and one that the run will complain
+    of by itself, has none."""
+    return [path for name in names if name and (path := _cached_folder(name)) is not None]
+
+
+def _cached_folder(name: str) -> Path | None:
+    from ihbench.diffusion.checkpoint import find_folder
+
+    try:
+        return find_folder(name, "")
+    except BadInput:
+        return None

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from ihbench.config_fields import STEPS, Within, check
-from ihbench.diffusion.weights_named import cached_folders
+from ihbench.diffusion.backbone_choice import cached_folders
 from ihbench.errors import BadInput
 from ihbench.fit.gaussians.density_config import DensityConfig
 from ihbench.metrics.weights import FILES, locate

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from ihbench.config_fields import STEPS, MultipleOf, Within, check
+from ihbench.diffusion.backbone_choice import cached_folders
 from ihbench.diffusion.inpaint_config import PAPER_INPAINT, QUICK_INPAINT, InpaintConfig
-from ihbench.diffusion.weights_named import cached_folders
 from ihbench.errors import BadInput
 from ihbench.fit.precision_name import Precision
 from ihbench.fit.prior_config import PriorConfig
