@@ -90,6 +90,31 @@ def test_killed_and_resumed_ends_the_same(tmp_path, dataset, monkeypatch):
     assert [row["step"] for row in curve_of(tmp_path / "part")] == [4]
 
 
+def test_moments_come_back_in_the_memory_format_of_their_parameters(tmp_path, dataset, monkeypatch):
+    """On a GPU convolutions are channels last, and the fused optimiser refuses moments that are not."""
+    trainer = MiniTrainer(SMALL, tmp_path, dataset, QUIET)
+    trainer._one_step(trainer.batches[0])
+    trainer.step = 1
+    trainer.save()
+    honest = MiniTrainer._restore
+
+    def on_a_gpu(self):
+        self.modules["unet"].to(memory_format=torch.channels_last)
+        honest(self)
+
+    monkeypatch.setattr(MiniTrainer, "_restore", on_a_gpu)
+    again = MiniTrainer(SMALL, tmp_path, dataset, QUIET)
+    for name, p in again.named.items():
+        state = again.optimizer.state.get(p, {})
+        kept = trainer.optimizer.state.get(trainer.named[name], {})
+        assert state.keys() == kept.keys()
+        for key, value in state.items():
+            torch.testing.assert_close(value, kept[key], rtol=0, atol=0)
+            assert value.dim() != 4 or value.stride() == p.stride(), name
+    assert any(p.dim() == 4 and not p.is_contiguous() for p in again.named.values())
+    again._one_step(again.batches[1])
+
+
 def test_worker_processes_make_the_same_batches(tmp_path, dataset):
     batches = MiniTrainer(SMALL, tmp_path, dataset, QUIET).batches
     for step, made in enumerate(batches.stream(0, 3, workers=2)):

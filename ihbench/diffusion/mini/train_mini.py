@@ -271,7 +271,7 @@ class MiniTrainer:
                     self.mean[name].copy_(tensors[f"mean.{name}"])
                     keys = ("step", "exp_avg", "exp_avg_sq")
                     if f"adam.{name}.step" in tensors:
-                        self.optimizer.state[p] = {key: tensors[f"adam.{name}.{key}"].to(p.device) for key in keys}
+                        self.optimizer.state[p] = {key: _like(p, tensors[f"adam.{name}.{key}"]) for key in keys}
         except (OSError, SafetensorError, KeyError, TypeError, AttributeError, ValueError, RuntimeError) as error:
             raise BadInput(f"{path}: not a readable training state ({error}); remove it to start again") from error
         self.step, self.seconds = step, seconds
@@ -285,3 +285,10 @@ def _widened(weight: Tensor, channels: int) -> Tensor:
     """[O, I, 3, 3] with so many inputs, the new ones of no weight: a ControlNet that knew the part map alone."""
     more = max(channels - weight.shape[1], 0)
     return torch.cat([weight, weight.new_zeros(len(weight), more, *weight.shape[2:])], 1)
+
+
+def _like(parameter: Tensor, kept: Tensor) -> Tensor:
+    """A kept tensor where a parameter lies; a moment in its memory format, too, as the fused optimiser wants it."""
+    if kept.shape != parameter.shape:  # the count of steps
+        return kept.to(parameter.device)
+    return torch.empty_like(parameter, dtype=kept.dtype).copy_(kept)
