@@ -74,6 +74,20 @@ def one_torch_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
+def begin_on_one_thread() -> None:
+    """For a worker process, one of as many as there are cores: torch, BLAS, OpenCV and numba work on one thread each
+    from now on. Otherwise sixteen workers have 256 threads, and all of them wait."""
+    import cv2
+    import numba
+    import torch
+    from threadpoolctl import threadpool_limits
+
+    torch.set_num_threads(1)
+    numba.set_num_threads(1)
+    cv2.setNumThreads(1)
+    threadpool_limits(1)
+
+
 @contextmanager
 def single_threaded_libraries() -> Iterator[None]:
     """BLAS and OpenCV work on one thread each while the caller's own threads do the work side by side.

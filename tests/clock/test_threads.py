@@ -6,10 +6,12 @@ import json
 import os
 import subprocess
 import sys
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 
 import pytest
 
-from ihbench.clock.threads import WAITING, WORDS
+from ihbench.clock.threads import WAITING, WORDS, begin_on_one_thread
 
 # says what OpenMP is going to read, at the moment at which torch is first looked for
 WATCH = f"""
@@ -74,3 +76,19 @@ def test_nothing_is_started_where_torch_comes_later_or_somebody_has_decided():
     assert said(code.format("import ihbench, torch")) == 1
     assert said(code.format("import torch, ihbench"), OMP_WAIT_POLICY="PASSIVE") == 1
     assert said(code.format("import torch, ihbench")) == 2
+
+
+def _threads_of_a_worker() -> dict[str, int]:
+    import cv2
+    import numba
+    import torch
+    from threadpoolctl import threadpool_info
+
+    pools = {entry["prefix"]: entry["num_threads"] for entry in threadpool_info()}
+    return pools | {"torch": torch.get_num_threads(), "numba": numba.get_num_threads(), "cv2": cv2.getNumThreads()}
+
+
+def test_a_worker_of_a_pool_begins_on_one_thread():
+    with ProcessPoolExecutor(1, get_context("spawn"), initializer=begin_on_one_thread) as pool:
+        found = pool.submit(_threads_of_a_worker).result()
+    assert set(found.values()) == {1}, found

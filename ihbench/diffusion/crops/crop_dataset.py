@@ -17,6 +17,7 @@ from ihbench import registry
 from ihbench.body import load_body
 from ihbench.clock.interruption import end_with_parent
 from ihbench.clock.progress import Progress
+from ihbench.clock.threads import begin_on_one_thread
 from ihbench.diffusion.crops.part_map import drawn_body, labels_of
 from ihbench.diffusion.crops.person_crop import PADDING, person_crop
 from ihbench.diffusion.crops.seen_surface import NOWHERE, uv_cells
@@ -91,7 +92,7 @@ class CropDataset:
         with progress.task("photographing people", len(missing) * PAGE) as task, ExitStack() as stack:
             try:
                 workers = min(os.cpu_count() or 1, len(missing))
-                pool = stack.enter_context(ProcessPoolExecutor(workers, initializer=end_with_parent))
+                pool = stack.enter_context(ProcessPoolExecutor(workers, initializer=_begin_worker))
             except (OSError, ImportError, NotImplementedError):  # no shared memory here, as in some sandboxes
                 written = map(_write_page, work)
             else:
@@ -102,6 +103,11 @@ class CropDataset:
     def pages(self, start: int, count: int) -> Iterator[Page]:
         for s in range(start, start + count, PAGE):
             yield _read_page(self.path(s))
+
+
+def _begin_worker() -> None:
+    end_with_parent()
+    begin_on_one_thread()
 
 
 def _write_page(work: tuple[str, int, int, int, Path]) -> None:
