@@ -43,11 +43,21 @@ class CompleteMasks:
         if k in self.painted:
             return self.painted[k]
         own, hidden = visible(view), may_hide(view, self.config)
-        if not hidden.any():
-            return own
+        return own | (hidden & self._covered(view)) if hidden.any() else own
+
+    def undecided(self, k: int, view: TrainView) -> NDArray[np.bool_]:
+        """[H, W] where nobody knows whether M̂ reaches: of a view that was not painted while others were, what may be
+        hidden just beside the posed body. Taken for background, it would cut people's clothes off."""
+        hidden = may_hide(view, self.config)
+        if not self.painted or k in self.painted or not hidden.any():
+            return np.zeros_like(hidden)
+        covered = self._covered(view)
+        return hidden & ~covered & _near(covered, self.config.inpaint.reach)
+
+    def _covered(self, view: TrainView) -> NDArray[np.bool_]:
         camera = view.camera
         projected = camera.project(self.body.pose(view.body_pose))
-        return own | (hidden & rasterize(projected, self.body.faces, camera.height, camera.width).mask)
+        return rasterize(projected, self.body.faces, camera.height, camera.width).mask
 
 
 def asked(view: TrainView, k: int, body: Body, config: OccFusionConfig, size: int, square: bool) -> CropView:

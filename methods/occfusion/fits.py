@@ -55,7 +55,9 @@ class Stage1(BigPoseFit[OccFusionAvatar]):
             avatar, training, seed, ledger, never, steps=config.steps, views=len(self._shown)
         )  # fmt: skip
         self._targets = LazyViews(
-            lambda k: prepare_target(avatar, views[k], training.background, masks.of(k, views[k])),
+            lambda k: prepare_target(
+                avatar, views[k], training.background, masks.of(k, views[k]), None, masks.undecided(k, views[k])
+            ),
             len(views),
             held=TARGETS_HELD,
         )
@@ -127,7 +129,8 @@ class Stage3(BigPoseFit[OccFusionAvatar]):
         )  # fmt: skip
         self._targets = LazyViews(
             lambda k: prepare_target(
-                avatar, views[k], training.background, masks.of(k, views[k]), generated.get(k)
+                avatar, views[k], training.background, masks.of(k, views[k]), generated.get(k),
+                masks.undecided(k, views[k]),
             ),
             len(views),
             held=TARGETS_HELD,

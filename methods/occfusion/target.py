@@ -40,7 +40,7 @@ class Target:
     image: Tensor  # [h, w, 3] the visible person on the background
     visible: Tensor  # [h, w, 1] V
     complete: Tensor  # [h, w, 1] M̂
-    box: Tensor  # [h, w, 1]
+    box: Tensor  # [h, w, 1] without what is undecided
     generated: Tensor | None  # [h, w, 3] G; None where nothing was generated for a view that hides something
 
 
@@ -50,17 +50,20 @@ def prepare_target(
     background: tuple[float, float, float],
     complete: NDArray[np.bool_],  # [H, W] M̂
     generated: NDArray[np.uint8] | None = None,  # [H, W, 3]
+    undecided: NDArray[np.bool_] | None = None,  # [H, W] where M̂ is not known
 ) -> Target:
-    """Cut a view to the box around the posed body. Colours of all but the visible person are the background's."""
+    """Cut a view to the box around the posed body, of which what is undecided is left out. Colours of all but the
+    visible person are the background's."""
     box = body_box(view.camera, avatar.body.pose(view.body_pose))
     window = box.rows, box.columns
     own, whole = visible(view)[window], complete[window]
+    unsure = np.zeros_like(own) if undecided is None else undecided[window]
     behind = np.array(background, np.float32)
     image = np.where(own[..., None], view.image[window].astype(np.float32) / 255, behind)
     made = None
     if generated is not None:
         made = np.where(whole[..., None], generated[window].astype(np.float32) / 255, behind)
-    elif not (whole & ~own).any():
+    elif not (whole & ~own).any() and not unsure.any():
         made = image
 
     def tensor(values: NDArray) -> Tensor:
@@ -74,7 +77,7 @@ def prepare_target(
         image=tensor(image),
         visible=tensor(own[..., None]),
         complete=tensor(whole[..., None]),
-        box=tensor(box.inside[..., None]),
+        box=tensor((box.inside & ~unsure)[..., None]),
         generated=None if made is None else tensor(made),
     )
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import distance_transform_edt
 
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
@@ -411,6 +412,32 @@ def test_check_7_complete_masks_know_nothing_but_the_masks():
         assert not (seen & ~complete).any()
         assert (truth & ~complete).sum() < 10
     assert np.array_equal(masks.of(0, larger[0]), visible(larger[0])), "nothing stands before it"
+
+
+def test_beside_the_body_of_an_unpainted_view_nothing_is_decided(views):
+    """Where some views are painted, another one's clothes are not cut to its body."""
+    config = replace(TINY, hidden="unknown")
+    view, hidden = views[1], views[1].mask == MaskState.UNKNOWN
+    covered = rasterize(view.camera.project(BODY.pose(view.body_pose)), BODY.faces, SIZE, SIZE).mask
+    painted = CompleteMasks({2: visible(views[2])}, BODY, config)
+    undecided = painted.undecided(1, view)
+    assert undecided.any()
+    assert not (undecided & (covered | ~hidden)).any()
+    distance = distance_transform_edt(~covered)
+    rows = np.flatnonzero(covered.any(1))
+    assert distance[undecided].max() <= max(config.inpaint.reach * (rows[-1] - rows[0] + 1), 1)
+    assert not painted.undecided(2, views[2]).any(), "it was painted"
+    assert not CompleteMasks({}, BODY, config).undecided(1, view).any(), "nothing was: the body alone decides"
+    avatar = OccFusionAvatar(config, BODY, 0)
+    given = avatar, view, WHITE, painted.of(1, view), None
+    plain, open_rim = prepare_target(*given), prepare_target(*given, undecided)
+    left_out = (plain.box - open_rim.box)[..., 0] > 0
+    assert left_out.any()
+    rgb, alpha = torch.zeros(*left_out.shape, 3), torch.zeros(left_out.shape)
+    alpha[left_out] = 1.0
+    for loss in (visible_loss, refine_loss):
+        assert loss(rgb, alpha, open_rim, config) == loss(rgb, alpha * 0, open_rim, config)
+        assert loss(rgb, alpha, plain, config) > loss(rgb, alpha * 0, plain, config)
 
 
 def test_without_a_painter_the_body_completes(views):
