@@ -5,17 +5,20 @@ Everything lies in temporary folders; nobody's cache, data or runs are touched.
 
 from __future__ import annotations
 
+import gc
 import io
+import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from unittest.mock import patch
 
 import pytest
+from filelock import FileLock
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # a process a core: more threads would only wait for each other
     os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -118,24 +121,48 @@ class Finished:
     outcome: Outcome
 
 
+def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:
+    """A folder that the first of the test processes to ask for it fills by `make`; the others wait and find it."""
+    together = factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        together = together.parent  # each process has a folder of its own in there
+    folder = together / name
+    with FileLock(together / f"{name}.lock"):
+        if not (folder / "made").exists():
+            shutil.rmtree(folder, ignore_errors=True)  # of a process that failed
+            folder.mkdir()
+            make(folder)
+            (folder / "made").touch()
+    return folder
+
+
 @pytest.fixture(scope="session")
 def studio(tmp_path_factory: pytest.TempPathFactory) -> Bench:
-    """The tiny protocol, and a cache that holds the stand-in pictures it reads and no more."""
-    home = tmp_path_factory.mktemp("studio")
-    bench = Bench(tiny_protocol(home / "tiny.toml"), home / "cache", home / "runs")
-    standin = registry.load("stand-in", "zju_mocap")
-    with bench.in_its_world():
-        wanted = wanted_frames(load_protocol(str(bench.protocol)), standin)
-        standin.ensure(standin_root("zju_mocap"), STANDIN_SEED, SCENES, wanted)
-    return bench
+    """The tiny protocol, and a cache that at first holds the stand-in pictures it reads and no more."""
+
+    def in_folder(home: Path) -> Bench:
+        return Bench(home / "tiny.toml", home / "cache", home / "runs")
+
+    def make(home: Path) -> None:
+        tiny_protocol(home / "tiny.toml")
+        standin = registry.load("stand-in", "zju_mocap")
+        with in_folder(home).in_its_world():
+            wanted = wanted_frames(load_protocol(str(home / "tiny.toml")), standin)
+            standin.ensure(standin_root("zju_mocap"), STANDIN_SEED, SCENES, wanted)
+
+    return in_folder(made_once(tmp_path_factory, "studio", make))
 
 
 @pytest.fixture(scope="session")
-def finished(studio: Bench) -> Finished:
-    outcome = studio.run()
-    assert outcome.status == 0, outcome.err
-    (folder,) = studio.folders()
-    return Finished(folder, outcome)
+def finished(studio: Bench, tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    def make(folder: Path) -> None:
+        outcome = replace(studio, runs=folder / "runs").run()
+        assert outcome.status == 0, outcome.err
+        (folder / "outcome.json").write_text(json.dumps(asdict(outcome)), encoding="utf-8")
+
+    home = made_once(tmp_path_factory, "finished", make)
+    (folder,) = replace(studio, runs=home / "runs").folders()
+    return Finished(folder, Outcome(**json.loads((home / "outcome.json").read_text(encoding="utf-8"))))
 
 
 @pytest.fixture
@@ -181,3 +208,9 @@ def broken_mannequin(mannequin: str, monkeypatch: pytest.MonkeyPatch) -> str:
 def contents(folder: Path) -> dict[str, bytes]:
     """Relative path -> bytes of every file below a folder."""
     return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def pytest_collection_finish() -> None:
+    """What importing made stays; collections of garbage, and every run makes a whole one, need not look at it."""
+    gc.collect()
+    gc.freeze()
