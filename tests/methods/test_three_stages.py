@@ -140,25 +140,27 @@ def told(when):
 
 honest = Stage1.run
 Stage1.run = lambda *a: (honest(*a), told("fitted"))
-one_fit = sys.argv[1] == "one fit"
-filler = "diffusion" if one_fit else sys.argv[1]
-inpaint = replace(InpaintConfig(), filler=filler, weights=sys.argv[2], key_views=1, turntable=1)
-if inpaint.filler == "diffusion":
-    inpaint = replace(inpaint, ti=False, lora=False, sg=False)
-config = replace(TINY, steps=2, one_fit=one_fit, inpaint=inpaint, refine=replace(QUICK.refine, steps=1, lpips=0.0))
 views = [train_view(a_camera(0.0, SIZE), a_pose(0.1 * k, 0.1 * k), slice(28, 36), frame=k) for k in range(2)]
-InpaintHuman(config).fit(training_set(views), device="cpu", seed=0, ledger=Ledger(), progress=Progress.silent())
-told("painted")
+for word in sys.argv[1:]:  # each may import more than those before it
+    one_fit = word == "one fit"
+    inpaint = replace(InpaintConfig(), filler="diffusion" if one_fit else word, key_views=1, turntable=1)
+    if inpaint.filler == "diffusion":
+        inpaint = replace(inpaint, ti=False, lora=False, sg=False)
+    refine = replace(QUICK.refine, steps=1, lpips=0.0)
+    config = replace(TINY, steps=2, one_fit=one_fit, inpaint=inpaint, refine=refine)
+    InpaintHuman(config).fit(training_set(views), device="cpu", seed=0, ledger=Ledger(), progress=Progress.silent())
+    told("painted")
 """
 
 
-@pytest.mark.parametrize(
-    ("filler", "loaded"), [("one fit", ""), ("temporal", " stage2"), ("diffusion", " stage2 diffusers transformers")]
-)
-def test_diffusers_is_imported_by_the_painter_that_needs_it(filler, loaded):
-    words = [sys.executable, "-c", WHAT_IS_IMPORTED, filler, ""]
+def test_diffusers_is_imported_by_the_painter_that_needs_it():
+    words = [sys.executable, "-c", WHAT_IS_IMPORTED, "one fit", "temporal", "diffusion"]
     done = subprocess.run(words, capture_output=True, text=True, timeout=300, cwd=Path(__file__).parents[2])
-    assert done.stdout.splitlines() == ["fitted", f"painted{loaded}"], done.stderr
+    assert done.stdout.splitlines() == [
+        *("fitted", "painted"),
+        *("fitted", "painted stage2"),
+        *("fitted stage2", "painted stage2 diffusers transformers"),
+    ], done.stderr
 
 
 def test_looking_at_mini_weights_imports_no_diffusers(mini):
@@ -175,11 +177,18 @@ class Killed(BaseException):
     pass
 
 
-@pytest.mark.parametrize("state", [TI_STATE, ADAPT_STATE, "stage2-sampled", "stage2-painted", "stage3"])
-def test_killed_in_any_stage_and_resumed_ends_the_same(tmp_path, mini, state, monkeypatch):
-    """Killed right after that state was saved; everything before it is not done again."""
+@pytest.fixture(scope="module")
+def uninterrupted(mini):
+    """A configuration, and the parameters that a fit with it ends with."""
     given = config(mini, batch=1)
-    whole = fit(given)
+    with one_torch_thread():
+        return given, parameters_of(fit(given))
+
+
+@pytest.mark.parametrize("state", [TI_STATE, ADAPT_STATE, "stage2-sampled", "stage2-painted", "stage3"])
+def test_killed_in_any_stage_and_resumed_ends_the_same(tmp_path, uninterrupted, state, monkeypatch):
+    """Killed right after that state was saved; everything before it is not done again."""
+    given, whole = uninterrupted
     ledger = Ledger(tmp_path)
     monkeypatch.setattr(ledger, "due_to_save", lambda: True)
     honest = ledger.save_state
@@ -194,7 +203,7 @@ def test_killed_in_any_stage_and_resumed_ends_the_same(tmp_path, mini, state, mo
         fit(given, ledger)
     again = Ledger(tmp_path)
     resumed = fit(given, again)
-    assert equal_bits(parameters_of(resumed), parameters_of(whole))
+    assert equal_bits(parameters_of(resumed), whole)
     assert state in [event.data["stage"] for event in again.events if event.kind == "resumed"]
     assert sum(event.kind == "inpainted" for event in again.events) == 1  # nothing that was measured is lost
     curves = [event.data["stage"] for event in again.events if event.kind == "loss_curve"]
