@@ -32,11 +32,9 @@ from ihbench.methods.gaussianavatar.schedule import (
     steps_of,
 )
 from ihbench.methods.gaussianavatar.stages import PoseStage, Stage1
-from ihbench.methods.gaussianavatar.stress import CASES
 from ihbench.methods.gaussianavatar.texel_network import TexelDecoder, TexelNorm, smoothing
 from ihbench.scene.contracts import MaskState, TrainingSet
 from ihbench.scene.plan import SceneMeasure
-from ihbench.stress.run import run_cases
 from tests.bench.fake_capture import WHITE, a_camera, a_pose, the_body, train_view
 from tests.methods.hidden_signature import hidden_signature, silhouette_iou
 
@@ -478,12 +476,6 @@ def test_a_missing_trunk_leaves_lpips_out_and_says_so(training, monkeypatch):
     assert equal(without, fitted(replace(TINY, lpips=0.0), training, ledger=ledger))
     monkeypatch.setattr(stages, "perceptual", lambda *_: lambda a, b: (a - b).square().mean())
     assert not equal(without, fitted(TINY, training))
-
-
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_stress_cases(case):
-    (outcome,) = run_cases([case])
-    assert outcome.verdict == "passed", outcome.reason
 
 
 # ------------------------------------------------------------------------------------------- save, load, plan

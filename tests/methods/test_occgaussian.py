@@ -26,10 +26,8 @@ from ihbench.methods.occgaussian.fitting import OccGaussianFit
 from ihbench.methods.occgaussian.method import OccGaussian
 from ihbench.methods.occgaussian.query import LISTED, Neighbourhood, make_query, neighbourhood
 from ihbench.methods.occgaussian.sightings import look_at, look_through, vertices_as_texels
-from ihbench.methods.occgaussian.stress import CASES
 from ihbench.scene.contracts import MaskState, TrainingSet
 from ihbench.scene.method_spec import method_spec
-from ihbench.stress.run import run_cases
 from tests.bench.fake_capture import WHITE, a_camera, a_pose, rasterized, the_body, train_view
 
 from .tiny_fit import equal_bits
@@ -510,11 +508,3 @@ def test_the_profiles_are_the_registered_ones_and_the_rows_footnote_is_told():
     assert PAPER.query.neighbours == 10
     assert "inferred" in spec.footnote
     assert "five times the frames" in spec.footnote
-
-
-def test_stress_cases_answer_as_expected():
-    names = ("rate-100", "all-pruned", "nan-pixel", "nan-hidden", "no-view")
-    chosen = [case for case in CASES if case.name.removeprefix("occgaussian-") in names]
-    assert len(chosen) == len(names)
-    outcomes = run_cases(chosen)
-    assert {outcome.verdict for outcome in outcomes} == {"passed"}, [outcome.row() for outcome in outcomes]

@@ -18,12 +18,11 @@ from ihbench.fit.gaussians.gaussian_set import Gaussians
 from ihbench.methods.three_dgs_avatar.config import PAPER, PROFILES, QUICK, SMOKE, leave_out
 from ihbench.methods.three_dgs_avatar.fitting import ThreeDgsAvatarFit, rates, skinning_weight
 from ihbench.methods.three_dgs_avatar.method import ThreeDgsAvatarMethod
-from ihbench.methods.three_dgs_avatar.stress import CASES, TINY, start
+from ihbench.methods.three_dgs_avatar.stress import TINY, start
 from ihbench.methods.three_dgs_avatar.target import BLACK, Target, image_loss, perceptual_loss, prepare_target
 from ihbench.render.splat import render_gaussians
 from ihbench.scene.contracts import MaskState
 from ihbench.scene.method_spec import method_spec
-from ihbench.stress.run import run_cases
 from tests.bench.fake_capture import WHITE, a_camera, a_pose, the_body, train_view
 
 from .tiny_fit import SIZE, STRIP, equal_bits, training_set, training_views
@@ -539,10 +538,3 @@ def test_it_is_registered_and_its_profiles_keep_the_released_order():
         for reset in profile.density.resets:
             later = [step for step in range(reset + 1, profile.steps) if profile.density.changes_at(step)]
             assert not later or later[0] - reset >= 50
-
-
-@pytest.mark.parametrize("name", ["rate-1", "rate-100", "rate-1e+30", "one-gaussian"])
-def test_stress_cases_pass(name):
-    (case,) = [case for case in CASES if case.name == f"three-dgs-avatar-{name}"]
-    (outcome,) = run_cases([case])
-    assert outcome.verdict == "passed", outcome.reason

@@ -69,29 +69,6 @@ def test_the_quick_groups_hold(cases):
     assert sum(o.condition is not None for o in outcomes) > 20
 
 
-NAMED = (
-    "inpainthuman-rate-1000",
-    "inpainthuman-rate-1e30",
-    "inpainthuman-nan-pixel",
-    "inpainthuman-nan-gradient-once",
-    "inpainthuman-nan-loss-for-good",
-    "inpainthuman-last-step",
-    "inpainthuman-speck",
-    "inpainthuman-nan-hidden",
-    "inpainthuman-bfloat16",
-    "inpainthuman-resumed-after-rejection",
-    "prediction-nan-elsewhere",
-    "ssim-loss-tiny-variance",
-    "psnr-one-step-float64",
-)
-
-
-@pytest.mark.parametrize("name", NAMED)
-def test_named_cases_pass(cases, name):
-    (outcome,) = run_cases([cases[name]])
-    assert outcome.verdict == "passed", outcome.reason
-
-
 # ------------------------------------------------------------------------------------------------ mutations
 
 
