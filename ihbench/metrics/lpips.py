@@ -17,6 +17,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -210,18 +211,23 @@ def _package(net: str) -> Any:
     return model.eval()
 
 
+@cache
+def _random_network(net: str, seed: int) -> Network:
+    import torch
+
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return Network(net, _package(net))
+
+
 @contextmanager
 def random_networks(seed: int = 0) -> Iterator[dict[str, Network]]:
     """For checks and tests only: networks with a seeded random trunk instead of the real ones.
 
     Whatever is computed inside is no LPIPS of anything and must never reach a result.
     """
-    import torch
-
-    with torch.random.fork_rng(devices=[]):
-        for net in NETS:
-            torch.manual_seed(seed)
-            _random[net] = Network(net, _package(net))
+    for net in NETS:
+        _random[net] = _random_network(net, seed)
     try:
         yield dict(_random)
     finally:
