@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -88,7 +89,8 @@ class GtuAvatar(nn.Module):
         """See `scene.contracts.Avatar`."""
         pose, transl = (torch.from_numpy(np.array(x)) for x in (body_pose.pose, body_pose.transl))
         joints = self.deformation.joints(body_pose.betas)
-        return self.posed(pose.to(joints), joints, transl.to(joints))
+        posed = self.posed(pose.to(joints), joints, transl.to(joints))
+        return replace(posed, weights=self.deformation.weights(self.gaussians.means))
 
     def render(
         self,

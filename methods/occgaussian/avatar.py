@@ -169,4 +169,6 @@ class OccGaussianAvatar(BigPoseAvatar[OccGaussianConfig]):
         if above:
             coefficients = torch.cat([coefficients, self.gaussians.attributes[REST][:, :above]], 1)
         covariances = skinned_covariance(shown.scales, self.gaussians.quaternions, posed.linear)
-        return PosedGaussians(posed.means, covariances, coefficients, None, shown.opacities, self.degree)
+        return PosedGaussians(
+            posed.means, covariances, coefficients, None, shown.opacities, self.degree, posed.weights
+        )

@@ -41,6 +41,7 @@ class Posed:
     means: Tensor  # [N, 3] m, world
     covariances: Tensor  # [N, 3, 3] m², world
     linear: Tensor  # [N, 3, 3] T of the skinning: a blend, no rotation
+    weights: Tensor  # [N, 24] of the skinning
     codes: Tensor | None  # [N, 16]; None before the non-rigid deformation begins
 
 
@@ -128,7 +129,7 @@ class ThreeDgsAvatar(nn.Module):
         linear = blended_linear(weights, frame.bones)
         shift = weights @ frame.bones[:, :3, 3]
         world = (linear @ means[:, :, None])[..., 0] + shift
-        return Posed(world, skinned_covariance(log_scales.exp(), quaternions, linear), linear, codes)
+        return Posed(world, skinned_covariance(log_scales.exp(), quaternions, linear), linear, weights, codes)
 
     def colours_of(
         self,
@@ -160,7 +161,8 @@ class ThreeDgsAvatar(nn.Module):
         before = pelvis + 3 * axis_angle_to_matrix(body_pose.pose[0])[:, 2]
         camera = Camera(np.eye(3), np.eye(3), -before, 1, 1)  # its place is all that matters
         colours = self.colours_of(posed, camera, None)
-        return PosedGaussians(posed.means, posed.covariances, colours, None, self.gaussians.opacities)
+        opacities = self.gaussians.opacities
+        return PosedGaussians(posed.means, posed.covariances, colours, None, opacities, weights=posed.weights)
 
     @torch.no_grad()
     def render(

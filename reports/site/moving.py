@@ -20,9 +20,12 @@ from ihbench.files.pictures import encoded, one_line
 from ihbench.metrics.eight_bit import displayed
 from ihbench.record.finished_run import FinishedRun
 from ihbench.record.results import RunResult
-from ihbench.reports.site.avatars import BAKING_POSES, PAINTED, BakedAvatar, Sight, bake, price
+from ihbench.reports.site.avatars import PAINTED, BakedAvatar, price
+from ihbench.reports.site.baking import Baked, bake
+from ihbench.reports.site.corrections import Corrections, samples_of
 from ihbench.reports.site.frames import Files, OpenScenes, SceneFrames
 from ihbench.reports.site.tables import number
+from ihbench.scene.contracts import TestView
 from ihbench.scene.regions import HIDDEN, NEVER_SEEN, VISIBLE
 from ihbench.scene.sightings import FINE
 from ihbench.scene.spread import spread
@@ -42,6 +45,7 @@ AROUND, SIDE = 12, 256  # pictures of a turntable, and their px
 FEW, PATIENCE = 4, 20.0  # of a method whose first two pictures take longer than that, s
 QUALITY = 88  # of these pictures: they are to be looked at, nothing is measured on them
 PROCEDURAL = "procedural"
+BAKING_POSES = 6
 
 
 def avatars(
@@ -95,28 +99,58 @@ def _avatar(
         return about | {"reason": f"its body, {subject.body.name}, may not be passed on with its weights (--share)"}
     rest = BodyPose(canonical_pose(A_POSE), subject.betas, np.zeros(3))
     views = [] if scorer is None else [scorer.scene.train[i] for i in spread(len(scorer.scene.train), BAKING_POSES)]
-    sights = [Sight(view.body_pose, view.camera.center) for view in views] or [Sight(rest)]
     seen = None if scorer is None else scorer.scene.training.sightings[FINE].visibility
-    baked = bake(subject, sights, seen)
-    if isinstance(baked, str):
-        return about | {"reason": baked}
-    own, skin = baked.packed()
+    made = bake(subject, [view.body_pose for view in views] or [rest], seen)
+    if isinstance(made, str):
+        return about | {"reason": made}
+    own, skin = made.avatar.packed()
     name = f"{shown.group if shown else 0} {run.scene}"
+    clips = {motion: find_motion(motion, FPS, subject.body, subject.betas) for motion in _chosen()}
     if "shared" not in motions:
-        known = registry.names("motion")
-        chosen = [motion for motion in SHOWN if motion in known]
-        body, betas = subject.body, subject.betas
-        motions["shared"] = {motion: _packed(find_motion(motion, FPS, body, betas)) for motion in chosen}
-    if scorer is not None and name not in motions:
-        motions[name] = {CAPTURE: _packed(_captured(subject))}
-    return about | baked.about | {
+        motions["shared"] = {motion: _packed(clip) for motion, clip in clips.items()}
+    if scorer is not None:
+        captured = _captured(subject)
+        motions.setdefault(name, {CAPTURE: _packed(captured)})
+        clips[CAPTURE] = captured
+    corrections = _corrections(made, subject, clips, rest, _tests(scorer, shown))
+    return about | made.avatar.about | {
         "reason": "",
         "own": carried.add(own, ".bin"),
         "skin": carried.add(skin, ".bin"),
-        "labels": _shares(baked),
+        "labels": _shares(made.avatar),
         "capture": name if name in motions else "",
-        "price": _prices(baked, subject, scorer, shown),
+        "price": _prices(made.avatar, subject, scorer, shown, clips, corrections),
+        "corrected": corrections and corrections.about | {"file": carried.add(corrections.packed(), ".bin")},
     }  # fmt: skip
+
+
+def _chosen() -> list[str]:
+    known = registry.names("motion")
+    return [motion for motion in SHOWN if motion in known]
+
+
+def _tests(scorer: Scorer | None, shown: SceneFrames | None) -> dict[str, TestView]:
+    """The pictured test views by what a page calls them."""
+    if scorer is None or shown is None:
+        return {}
+    at = {(key.camera_id, key.frame): k for k, key in enumerate(scorer.scene.test_keys)}
+    keys = [(view["camera"], view["frame"]) for view in shown.views]
+    return {f"{camera}/{frame}": scorer.scene.test[at[camera, frame]] for camera, frame in keys}
+
+
+def _corrections(
+    made: Baked, subject: Subject, clips: Mapping[str, Motion], rest: BodyPose, tests: Mapping[str, TestView]
+) -> Corrections | None:
+    """Of the A-pose, of the pictured test views and along the motions; None where the avatar needs none."""
+    if made.corrections is None:
+        return None
+    of, samples = made.corrections, {}
+    samples["rest"] = of(rest)[None]
+    samples |= {f"view {name}": of(view.body_pose)[None] for name, view in tests.items()}
+    for name, clip in clips.items():
+        poses = clip.body_poses(subject.betas)
+        samples[f"motion {name}"] = np.stack([of(poses[k]) for k in samples_of(len(poses), clip.cyclic)])
+    return Corrections.of(samples)
 
 
 def _shares(baked: BakedAvatar) -> dict[str, float]:
@@ -129,26 +163,33 @@ def _shares(baked: BakedAvatar) -> dict[str, float]:
 
 
 def _prices(
-    baked: BakedAvatar, subject: Subject, scorer: Scorer | None, shown: SceneFrames | None
+    baked: BakedAvatar,
+    subject: Subject,
+    scorer: Scorer | None,
+    shown: SceneFrames | None,
+    clips: Mapping[str, Motion],
+    corrections: Corrections | None,
 ) -> dict[str, list[Any]]:
-    """Where it was measured -> [PSNR, IoU]: in some of the pictured test views, and in the middle of a motion."""
+    """Where it was measured -> [PSNR, IoU]: in some of the pictured test views, and early in a motion."""
     prices: dict[str, list[Any]] = {}
     if scorer is None or shown is None:
         return prices
-    background = scorer.scene.protocol.image.background
-    at = {(key.camera_id, key.frame): k for k, key in enumerate(scorer.scene.test_keys)}
-    for i in spread(len(shown.views), PRICED_VIEWS):
-        camera, frame = shown.views[i]["camera"], shown.views[i]["frame"]
-        view = scorer.scene.test[at[camera, frame]]
-        found = price(baked, subject, view.camera, view.body_pose, background)
-        prices[f"{camera}/{frame}"] = [number(found.psnr), number(found.iou)]
-    for name in [name for name in PRICED_MOTIONS if name in registry.names("motion")]:
-        motion = find_motion(name, FPS, subject.body, subject.betas)
-        pose = motion.body_poses(subject.betas)[len(motion) // 4]
+    background, tests = scorer.scene.protocol.image.background, _tests(scorer, shown)
+    for name in [list(tests)[i] for i in spread(len(tests), PRICED_VIEWS)]:
+        view, correction = tests[name], corrections and corrections.at(f"view {name}")
+        found = price(baked, subject, view.camera, view.body_pose, background, correction)
+        prices[name] = [number(found.psnr), number(found.iou)]
+    for name in [name for name in PRICED_MOTIONS if name in clips]:
+        frame = len(clips[name]) // 4
+        pose, correction = _pose(clips[name], frame, subject), corrections and corrections.at(f"motion {name}", frame)
         camera = _framing(subject, pose).camera(0, 20.0, SIDE, SIDE)
-        found = price(baked, subject, camera, pose, background)
+        found = price(baked, subject, camera, pose, background, correction)
         prices[f"motion {name}"] = [number(found.psnr), number(found.iou)]
     return prices
+
+
+def _pose(motion: Motion, frame: int, subject: Subject) -> BodyPose:
+    return motion.body_poses(subject.betas)[frame]
 
 
 def _framing(subject: Subject, pose: BodyPose) -> Framing:

@@ -1,5 +1,6 @@
 """What is exported of an avatar is what it draws: `posed_gaussians` of the methods that have no test of their own."""
 
+from dataclasses import replace
 from importlib import import_module
 
 import numpy as np
@@ -29,7 +30,24 @@ def test_what_is_exported_is_what_is_drawn(method):
         own = avatar.posed_gaussians(pose)
         rgb, alpha = (x.detach().numpy() for x in own.draw(camera, (1.0, 1.0, 1.0)))
         shown, covered = avatar.render(camera, pose)
+        other = replace(pose, pose=pose.pose + 0.2 * np.random.default_rng(0).normal(size=(24, 3)))
+        moved = avatar.posed_gaussians(other)
     assert len(own.means) == len(avatar.gaussians)
     assert covered.max() > 0.3
     np.testing.assert_allclose(np.clip(rgb, 0, 1), shown, atol=2e-5)
     np.testing.assert_allclose(np.clip(alpha, 0, 1), covered, atol=2e-5)
+    # what it says that it is skinned with takes its Gaussians from one pose to another
+    assert own.weights is not None
+    np.testing.assert_allclose(own.weights.sum(1), 1, atol=1e-5)
+    if method == "three_dgs_avatar":  # which blends products of transforms, softly before it is trained
+        return
+    here, there = (own.weights.numpy() @ _flat(avatar.body, p) for p in (pose, other))
+    here, there = (blend.reshape(-1, 3, 4) for blend in (here, there))
+    rest = np.linalg.solve(here[:, :, :3], (own.means.numpy() - here[:, :, 3])[:, :, None])
+    predicted = (there[:, :, :3] @ rest)[:, :, 0] + there[:, :, 3]
+    assert np.abs(moved.means.numpy() - own.means.numpy()).max() > 0.05
+    np.testing.assert_allclose(predicted, moved.means.numpy(), atol=5e-3)  # poses are corrected a little
+
+
+def _flat(body, pose):
+    return body.joint_transforms(pose)[:, :3].reshape(24, 12).astype(np.float32)

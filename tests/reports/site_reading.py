@@ -6,7 +6,7 @@ import base64
 import hashlib
 import json
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from html.parser import HTMLParser
 from typing import Any
 
@@ -69,7 +69,8 @@ def unpacked(own: bytes, skin: bytes, about: dict[str, Any]) -> dict[str, np.nda
     """What a page makes of an avatar's two files."""
     n = about["count"]
     own, skin = (np.frombuffer(zlib.decompress(data, -15), np.uint8) for data in (own, skin))
-    assert (len(own), len(skin)) == ((23 if about["general"] else 12) * n, 8 * n)
+    above = (about["degree"] + 1) ** 2 - 1
+    assert (len(own), len(skin)) == ((23 if about["general"] else 12) * n + 3 * above * n, 8 * n)
     at = 0
 
     def wides(count):
@@ -94,17 +95,23 @@ def unpacked(own: bytes, skin: bytes, about: dict[str, Any]) -> dict[str, np.nda
     else:
         found["scales"] = np.exp(low + wides(1)[:, 0] * (high - low))
     found |= {"colours": narrows(3), "labels": narrows(1)[:, 0]}
+    if above:
+        found["harmonics"] = narrows(3 * above).reshape(n, above, 3)
     planes = np.cumsum(skin.reshape(8, n), 1, dtype=np.uint8)
     return found | {"bones": planes[:4].T, "weights": planes[4:].T}
 
 
 @dataclass
 class Plates:
-    """An avatar of flat, half transparent Gaussians on the body, moved by the body alone; any colours."""
+    """An avatar of flat, half transparent Gaussians on the body, of any colours, from every side others up to
+    `degree`. It says what skins it where it is `told`, and turns its elbows by itself where it is `learned`."""
 
     body: Any
     betas: np.ndarray
     count: int = 900
+    degree: int | None = None
+    told: bool = False
+    learned: bool = False
 
     def __post_init__(self):
         from ihbench.body.uv import texel_table
@@ -116,17 +123,26 @@ class Plates:
         self.weights_ = texels.interpolate(self.body.weights, self.body.faces)[some]
         self.factors = rng.normal(size=(self.count, 3, 3)) * (0.03, 0.01, 0.002)
         self.opacities, self.colours = rng.uniform(0.2, 1, self.count), rng.uniform(0, 1, (self.count, 3))
+        if self.degree is not None:
+            self.colours = rng.normal(size=(self.count, (self.degree + 1) ** 2, 3)) * 0.2
 
     def posed_gaussians(self, pose):
-        from types import SimpleNamespace
-
         import torch
 
+        from ihbench.fit.gaussians.posed import PosedGaussians
+
+        pose = self.as_learned(pose) if self.learned else pose
         blend = np.tensordot(self.weights_, self.body.joint_transforms(pose)[:, :3], 1)
         factors = blend[:, :, :3] @ self.factors
         means = np.einsum("nab,nb->na", blend[:, :, :3], self.rest) + blend[:, :, 3]
-        parts = (means, factors @ factors.transpose(0, 2, 1), self.colours, self.opacities)
-        means, covariances, colours, opacities = (torch.from_numpy(part.astype(np.float32)) for part in parts)
-        return SimpleNamespace(
-            means=means, scales=covariances, colors=colours, quaternions=None, opacities=opacities, sh_degree=None
-        )
+        parts = (means, factors @ factors.transpose(0, 2, 1), self.colours, self.opacities, self.weights_)
+        means, covariances, colours, opacities, weights = (torch.from_numpy(p.astype(np.float32)) for p in parts)
+        told = weights if self.told else None
+        return PosedGaussians(means, covariances, colours, None, opacities, self.degree, told)
+
+    @staticmethod
+    def as_learned(pose):
+        """More the further the back is bent."""
+        angles = np.array(pose.pose)
+        angles[[18, 19], 1] += 1.5 * np.sin(angles[3, 0])
+        return replace(pose, pose=angles)

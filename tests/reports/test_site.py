@@ -6,6 +6,7 @@ import json
 import shutil
 import threading
 import tomllib
+import zlib
 from http.server import ThreadingHTTPServer
 from types import SimpleNamespace
 
@@ -26,10 +27,12 @@ from ihbench.record.finished_run import FinishedRun
 from ihbench.record.results import read_result, summary
 from ihbench.record.schema import score_lines
 from ihbench.record.store import RunFolder
-from ihbench.reports.site import avatars, build, moving, painted, tables
+from ihbench.render.spherical_harmonics import colors_of
+from ihbench.reports.site import avatars, baking, build, corrections, moving, painted, tables
 from ihbench.reports.site.frames import REGIONS, Files, OpenScenes
 from ihbench.reports.site.server import Followed, handler, own_port
 from ihbench.scene.mask_state import MaskState
+from ihbench.scene.sightings import FINE
 from ihbench.scoring.scoring import Scorer
 from ihbench.show.subject import Subject
 from tests.reports import fake_runs
@@ -197,8 +200,8 @@ def test_an_avatar_travels(studio, site, finished):
     with studio.in_its_world():
         run = FinishedRun(finished.folder)
         subject, scene = Subject(run), run.scene
-        sights = [avatars.Sight(scene.train[k].body_pose) for k in range(3)]
-        baked = avatars.bake(subject, sights, scene.training.sightings[avatars.FINE].visibility)
+        poses = [scene.train[k].body_pose for k in range(3)]
+        baked = baking.bake(subject, poses, scene.training.sightings[FINE].visibility).avatar
         again = unpacked(*baked.packed(), baked.about)
         for name, values in again.items():
             assert np.allclose(values, getattr(baked, name), atol=1e-9), name
@@ -230,7 +233,7 @@ def test_a_price_is_paid_for_what_was_changed(studio, finished):
     with studio.in_its_world():
         run = FinishedRun(finished.folder)
         subject, view = Subject(run), run.scene.test[0]
-        baked = avatars.bake(subject, [avatars.Sight(view.body_pose)], None)
+        baked = baking.bake(subject, [view.body_pose], None).avatar
         object.__setattr__(baked, "rest", baked.rest + 0.02)
         paid = avatars.price(baked, subject, view.camera, view.body_pose, (1.0, 1.0, 1.0))
     assert paid.psnr < 30
@@ -243,34 +246,88 @@ def test_general_gaussians_come_back_from_any_pose():
     poses = [BodyPose(0.3 * rng.normal(size=(24, 3)), betas, rng.normal(size=3)) for _ in range(3)]
     plates = Plates(body, betas)
     subject = SimpleNamespace(avatar=plates, body=body, betas=betas)
-    baked = avatars.bake(subject, [avatars.Sight(pose) for pose in poses], None)  # type: ignore[arg-type]
+    baked = baking.bake(subject, poses, None).avatar  # type: ignore[arg-type]
     found = unpacked(*baked.packed(), baked.about)
     for name, values in found.items():
         assert np.allclose(values, getattr(baked, name), atol=1e-9), name
     far = np.abs(baked.rest - plates.rest).max(1)  # weights may be those of a neighbouring point
     assert np.median(far) < 2e-3
     assert np.quantile(far, 0.95) < 0.02
-    factors = avatars._axes(baked.turns) * baked.scales[:, None, :]
+    factors = avatars.axes_of(baked.turns) * baked.scales[:, None, :]
     expected = plates.factors @ plates.factors.transpose(0, 2, 1)
     error = np.abs(factors @ factors.transpose(0, 2, 1) - expected).max((1, 2)) / np.abs(expected).max((1, 2))
     assert np.median(error) < 0.02
     assert np.abs(baked.opacities / 255 - plates.opacities).max() < 0.003
 
 
-def test_colours_of_a_direction_are_those_that_the_cameras_saw():
-    gaussians = SimpleNamespace(
-        means=torch.zeros(2, 3), scales=torch.ones(2, 3), quaternions=torch.tensor([[1.0, 0, 0, 0]] * 2),
-        opacities=torch.ones(2), sh_degree=1, colors=torch.tensor([[[0.4] * 3, [0.0] * 3, [0.3] * 3, [0.0] * 3]] * 2),
-    )  # fmt: skip
-    front, back, nowhere = (avatars._numbers(gaussians, c).colours[0, 0] for c in ([0, 0, 3.0], [0, 0, -3.0], None))
-    c0, c1 = 0.28209479177387814, 0.4886025119029199
-    assert (front, back) == pytest.approx((0.5 + 0.4 * c0 - 0.3 * c1, 0.5 + 0.4 * c0 + 0.3 * c1), abs=1e-6)
-    assert nowhere == pytest.approx(0.5 + 0.4 * c0, abs=1e-6)
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_colours_of_all_directions_travel(degree):
+    """As the bench's renderer sees them; and harmonics that nobody would see stay at home."""
+    body, pose = load_body(), BodyPose(np.zeros((24, 3)), np.zeros(10), np.zeros(3))
+    plates = Plates(body, pose.betas, degree=degree, told=True)
+    subject = SimpleNamespace(avatar=plates, body=body, betas=pose.betas)
+    baked = baking.bake(subject, [pose], None).avatar  # type: ignore[arg-type]
+    found = unpacked(*baked.packed(), baked.about)
+    assert baked.degree == degree
+    assert ("harmonics" in found) == (degree > 0)
+    for name, values in found.items():
+        assert np.allclose(values, getattr(baked, name), atol=1e-9), name
+    center = np.array([1.0, 2.0, 3.0])
+    ours, theirs = (
+        colors_of(torch.from_numpy(colours), torch.from_numpy(plates.rest), torch.from_numpy(center), degree).numpy()
+        for colours in (baked.shades.reshape(len(baked), -1, 3) if degree else _flat(baked), plates.colours)
+    )
+    assert np.sqrt(np.mean((ours - theirs) ** 2)) < 0.012
+    if degree == 3:
+        plates.colours[:, 1:] *= 0.01
+        plates.colours[:, 4:] = 0
+        assert baking.bake(subject, [pose], None).avatar.degree == 0  # type: ignore[arg-type]
+
+
+def _flat(baked):
+    return (baked.shades[:, None] - 0.5) / 0.28209479177387814
+
+
+def test_what_a_method_does_to_joints_itself_travels():
+    """Without corrections the page's avatar holds its arms as the body does, not as the method does."""
+    body, betas = load_body(), np.zeros(10)
+    rng = np.random.default_rng(2)
+    plates = Plates(body, betas, told=True, learned=True)
+    subject = SimpleNamespace(avatar=plates, body=body, betas=betas)
+    poses = [BodyPose(0.3 * rng.normal(size=(24, 3)), betas, rng.normal(size=3)) for _ in range(6)]
+    made = baking.bake(subject, poses, None)  # type: ignore[arg-type]
+    assert not isinstance(made, str)
+    assert made.corrections is not None
+    new = BodyPose(0.3 * rng.normal(size=(24, 3)), betas, rng.normal(size=3))
+    kept = corrections.Corrections.of({"one": made.corrections(new)[None], "two": np.zeros((3, 24, 3, 4))})
+    theirs = plates.posed_gaussians(new).means.numpy()
+    missed = [np.sqrt(((made.avatar.means(body, new, c) - theirs) ** 2).sum(1)) for c in (None, kept.at("one"))]
+    assert missed[0].max() > 0.03
+    assert missed[1].max() < 0.005  # four weights are kept
+    assert missed[1].mean() < 0.0002
+    plates.learned = False
+    assert baking.bake(subject, poses, None).corrections is None  # type: ignore[union-attr, arg-type]
+
+
+def test_corrections_lie_on_lines_between_samples():
+    one = np.tile(np.eye(3, 4), (24, 1, 1))
+    values = np.stack([one, one + 0.2, one - 0.1])
+    kept = corrections.Corrections.of({"a": one[None] + 0.4, "b": values})
+    assert kept.clips == {"a": (0, 1), "b": (1, 3)}
+    for frame, expected in ((0, 0.0), (1, 0.1), (2, 0.2), (3, 0.05), (4, -0.1), (9, -0.1)):
+        assert np.allclose(kept.at("b", frame), one + expected, atol=2e-5), frame
+    assert np.allclose(kept.at("a", 1), one + 0.4, atol=2e-5)
+    assert corrections.samples_of(5, cyclic=True) == [0, 2, 4, 1]
+    assert corrections.samples_of(5, cyclic=False) == [0, 2, 4, 4]
+    planes = np.frombuffer(zlib.decompress(kept.packed(), -15), np.uint8).astype(np.uint16)
+    low, high = planes[: len(planes) // 2], planes[len(planes) // 2 :]
+    levels = np.cumsum(low + 256 * high, dtype=np.uint16).view(np.int16).reshape(-1, 4).T
+    assert np.array_equal(levels.reshape(4, 24, 3, 4), kept.levels)
 
 
 def test_what_cannot_be_skinned_says_so():
     subject = SimpleNamespace(avatar=SimpleNamespace(), body=load_body(), betas=np.zeros(10))
-    assert "no Gaussians" in avatars.bake(subject, [], None)  # type: ignore[arg-type]
+    assert "no Gaussians" in baking.bake(subject, [], None)  # type: ignore[arg-type]
 
 
 def test_one_avatar_does_not_take_the_page_along(results, monkeypatch):

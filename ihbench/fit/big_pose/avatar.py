@@ -18,6 +18,7 @@ from ihbench.config_fields import read
 from ihbench.fit.avatar_files import read_avatar, write_avatar
 from ihbench.fit.big_pose.config import BigPoseConfig
 from ihbench.fit.big_pose.deformation import Deformation, Frame, Posed
+from ihbench.fit.decoded_cache import DecodedCache
 from ihbench.fit.gaussians.gaussian_set import Gaussians
 from ihbench.fit.gaussians.harmonics import grey_harmonics, harmonics_in_use
 from ihbench.fit.gaussians.posed import PosedGaussians
@@ -51,6 +52,7 @@ class BigPoseAvatar(nn.Module, Generic[Config]):
         generator = torch.Generator().manual_seed(seed)
         self.pose_correction = PoseCorrection(generator) if config.pose_network else None
         self.weight_offsets = WeightOffsets(seed) if config.weight_network else None
+        self._cache: DecodedCache[tuple[Tensor, Tensor | None]] = DecodedCache()
 
     def __len__(self) -> int:
         return len(self.gaussians)
@@ -64,16 +66,16 @@ class BigPoseAvatar(nn.Module, Generic[Config]):
         """[N, (degree + 1)², 3] the spherical harmonics in use."""
         return harmonics_in_use(self.gaussians, self.degree)
 
-    def posed(self, frame: Frame, vertex: Tensor | None = None) -> Posed:  # vertex [N] int64
-        """The Gaussians in a frame; by the vertices that they carry unless others are given."""
-        means = self.gaussians.means
-        return self.deformation(
-            means,
-            self.gaussians.carried(VERTEX) if vertex is None else vertex,
-            frame,
-            self.weight_offsets(means) if self.weight_offsets is not None else None,
-            self.pose_correction(frame.pose) if self.pose_correction is not None else None,
-        )
+    def posed(self, frame: Frame) -> Posed:
+        """The Gaussians in a frame, by the vertices that they carry."""
+        return self._skinned(frame, self.gaussians.carried(VERTEX), self._offsets())
+
+    def _skinned(self, frame: Frame, vertex: Tensor, offsets: Tensor | None) -> Posed:  # [N] int64; [N, 24]
+        correction = self.pose_correction(frame.pose) if self.pose_correction is not None else None
+        return self.deformation(self.gaussians.means, vertex, frame, offsets, correction)
+
+    def _offsets(self) -> Tensor | None:
+        return self.weight_offsets(self.gaussians.means) if self.weight_offsets is not None else None
 
     def covariances(self, posed: Posed) -> Tensor:
         """[N, 3, 3] m², world."""
@@ -81,8 +83,8 @@ class BigPoseAvatar(nn.Module, Generic[Config]):
 
     def drawn(self, posed: Posed) -> PosedGaussians:
         """Gaussians that are posed, with the attributes that are drawn."""
-        opacities = self.gaussians.opacities
-        return PosedGaussians(posed.means, self.covariances(posed), self.sh, None, opacities, self.degree)
+        covariances, opacities = self.covariances(posed), self.gaussians.opacities
+        return PosedGaussians(posed.means, covariances, self.sh, None, opacities, self.degree, posed.weights)
 
     def draw(
         self,
@@ -102,8 +104,12 @@ class BigPoseAvatar(nn.Module, Generic[Config]):
     def posed_gaussians(self, body_pose: BodyPose) -> PosedGaussians:
         """See `scene.contracts.Avatar`. As released, the pose network corrects any pose, also those
         that nobody trained on."""
-        vertex = self.deformation.nearest(self.gaussians.means)
-        return self.drawn(self.posed(self.deformation.frame(body_pose), vertex))
+
+        def decode() -> tuple[Tensor, Tensor | None]:  # of all poses the same
+            return self.deformation.nearest(self.gaussians.means), self._offsets()
+
+        vertex, offsets = self._cache.get(self, b"", decode)
+        return self.drawn(self._skinned(self.deformation.frame(body_pose), vertex, offsets))
 
     def render(
         self,

@@ -50,6 +50,7 @@ class Posed:
 
     means: Tensor  # [N, 3] m
     linear: Tensor  # [N, 3, 3] B
+    weights: Tensor  # [N, 24] w
 
 
 class Deformation(nn.Module):
@@ -137,7 +138,7 @@ class Deformation(nn.Module):
         turn, back = turn.unflatten(1, (3, 3)), inverse(big_turn.unflatten(1, (3, 3)))
         rest = (back @ (points - big_shift)[..., None])[..., 0]
         shape = rest + self._blend_offsets(rotations, frame.shape_offsets)[nearest]
-        return Posed((turn @ shape[..., None])[..., 0] + shift, turn @ back)
+        return Posed((turn @ shape[..., None])[..., 0] + shift, turn @ back, weights)
 
     def _blend_offsets(self, rotations: Tensor, shape_offsets: Tensor) -> Tensor:
         """[V, 3] m: S β + P(θ) - P(θ_big)."""

@@ -14,7 +14,10 @@ from ihbench.render.splat import render_gaussians
 
 @dataclass(frozen=True)
 class PosedGaussians:
-    """The arguments of `render.splat.render_gaussians` but for camera and background; world, metres."""
+    """The arguments of `render.splat.render_gaussians` but for camera and background; world, metres.
+
+    `weights` are what the Gaussians were skinned with, where they were: a viewer can then move them by itself.
+    """
 
     means: Tensor  # [N, 3] m
     scales: Tensor  # [N] or [N, 3] m, standard deviations, or [N, 3, 3] m², covariances
@@ -22,6 +25,7 @@ class PosedGaussians:
     quaternions: Tensor | None = None  # [N, 4] w x y z, of scales [N, 3]
     opacities: Tensor | None = None  # [N] 0..1; None: opaque
     sh_degree: int | None = None  # None: `colors` are colours
+    weights: Tensor | None = None  # [N, 24] of the joints, rows sum to 1
 
     def draw(
         self, camera: Camera, background: Sequence[float] | Tensor, outputs: Sequence[str] = ("rgb", "alpha")

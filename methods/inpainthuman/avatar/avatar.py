@@ -219,7 +219,7 @@ class GaussianAvatar(nn.Module):
 
     def posed_gaussians(self, body_pose: BodyPose) -> PosedGaussians:
         """The same as files have them; see `scene.contracts.Avatar`."""
-        return PosedGaussians(*self.gaussians(body_pose))
+        return PosedGaussians(*self.gaussians(body_pose), weights=self.weights)
 
     def render(
         self,

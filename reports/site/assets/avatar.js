@@ -65,6 +65,7 @@ function turntable(about) {
 
 function viewer(run, about, view, motion) {
   const clip = motion && (DATA.motions[about.capture]?.[motion] ?? DATA.motions.shared[motion]);
+  if (clip) clip.name = motion;
   const canvas = el("canvas", { tabindex: "0", "aria-label": "the avatar; drag or use the arrow keys to turn, + and - to come near",
     width: 512, height: 512 });
   const place = el("div", {}, canvas);
@@ -182,7 +183,17 @@ function posed(avatar, view, clip) {
     }
     rotations.push(R);
   }
-  return chain(rotations, avatar.joints, DATA.parents, transl);
+  const name = clip ? `motion ${clip.name}` : view ? `view ${view.camera}/${view.frame}` : "rest";
+  return chain(rotations, avatar.joints, DATA.parents, transl, beyond(avatar.corrections, name, clip ? held.t * clip.frames : 0));
+}
+
+// [288] what the method does to the joints itself at a frame of a clip, between two samples on a line; null for nothing
+function beyond(of, name, frame) {
+  if (!of?.clips[name]) return null;
+  const [begin, count] = of.clips[name];
+  const at = Math.min(Math.floor(frame + 1e-6) / of.step, count - 1), low = Math.floor(at), high = Math.min(low + 1, count - 1);
+  const level = (k, sample) => of.levels[k * of.samples + begin + sample];
+  return Float32Array.from({ length: 12 * JOINTS }, (_, k) => (level(k, low) + (at - low) * (level(k, high) - level(k, low))) / 32767 * of.largest);
 }
 
 function fixedCamera(view) {

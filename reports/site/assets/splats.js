@@ -1,7 +1,8 @@
 // A small WebGL2 renderer of skinned Gaussians. It draws what the bench's own renderer draws (ihbench/render/splat.py):
 // opaque circles of variance (f s / z)² + LOW_PASS px², or footprints J R Σ Rᵀ Jᵀ + LOW_PASS of general ones; alpha
 // min(largest, opacity exp(-dᵀ Σ⁻¹ d / 2)) down to one grey level; back to front. Gaussians are posed in the vertex
-// shader, means and covariances, by a blend of 24 joints' transforms.
+// shader, means and covariances, by a blend of 24 joints' transforms; their colours may be spherical harmonics of the
+// direction of view in the world, with the signs and the order of ihbench/render/spherical_harmonics.py.
 
 const NEAR = 0.01, LOW_PASS = 0.3, CLAMP = 0.3, JOINTS = 24, ROW = 1024;
 const ALPHA_MAX = { opaque: 0.999, general: 0.99 };
@@ -14,6 +15,10 @@ precision highp usampler2D;
 uniform sampler2D places;    // x y z of the rest pose, and the scale, m
 uniform usampler2D skins;    // four joints, their four weights, colour and label; 8 bits each
 uniform sampler2D shapes;    // of general ones, side by side: xx xy xz yy, and yz zz opacity, m²
+uniform sampler2D harmonics; // the K colours above degree 0 of one after the other, 127 of 255 is 0
+uniform int degree;
+uniform vec3 tone;           // colours: the least and the range; harmonics: what 254 of 255 stands for
+uniform vec3 eye;            // m, world
 uniform bool general;
 uniform vec4 joints[${3 * JOINTS}];
 uniform vec4 view[3];        // world to camera, row by row
@@ -30,6 +35,20 @@ vec4 bytes(uint four) {
   return vec4(four & 255u, (four >> 8) & 255u, (four >> 16) & 255u, four >> 24);
 }
 const vec3 TINTS[5] = vec3[5](vec3(.6), vec3(0., .620, .451), vec3(.835, .369, 0.), vec3(.8, .475, .655), vec3(.902, .624, 0.));
+vec3 harmonic(int k) {  // k = 1 is the first of degree 1
+  int at = int(number) * ((degree + 1) * (degree + 1) - 1) + k - 1;
+  return (texelFetch(harmonics, ivec2(at % ${ROW}, at / ${ROW}), 0).rgb * 255. / 127. - 1.) * tone.z;
+}
+vec3 shade(vec3 d) {
+  float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
+  vec3 sum = .4886025119029199 * (z * harmonic(2) - y * harmonic(1) - x * harmonic(3));
+  if (degree > 1) sum += 1.0925484305920792 * (x * y * harmonic(4) - y * z * harmonic(5) - x * z * harmonic(7))
+    + .31539156525252005 * (2. * zz - xx - yy) * harmonic(6) + .5462742152960396 * (xx - yy) * harmonic(8);
+  if (degree > 2) sum += 2.890611442640554 * x * y * z * harmonic(10) + .3731763325901154 * z * (2. * zz - 3. * xx - 3. * yy) * harmonic(12)
+    - .4570457994644658 * (4. * zz - xx - yy) * (y * harmonic(11) + x * harmonic(13)) + 1.445305721320277 * z * (xx - yy) * harmonic(14)
+    - .5900435899266435 * (y * (3. * xx - yy) * harmonic(9) + x * (xx - 3. * yy) * harmonic(15));
+  return sum;
+}
 void main() {
   ivec2 at = ivec2(number % ${ROW}u, number / ${ROW}u);
   vec4 place = texelFetch(places, at, 0);
@@ -45,7 +64,8 @@ void main() {
   vec3 p = vec3(dot(view[0], world), dot(view[1], world), dot(view[2], world));
   vec4 look = bytes(skin.z);
   int label = int(look.w);
-  colour = look.rgb / 255.;
+  colour = tone.x + tone.y * look.rgb / 255.;
+  if (degree > 0) colour = max(colour + shade(normalize(world.xyz - eye)), 0.);
   int part = label & 3;
   if ((label & 4) != 0 && (tinted & 256) != 0) part = 4;
   else if ((tinted & (1 << part)) == 0) part = -1;
@@ -113,17 +133,18 @@ class Splats {
     gl.linkProgram(this.program);
     if (!gl.getProgramParameter(this.program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(this.program) ?? "no program");
     gl.useProgram(this.program);
-    this.at = Object.fromEntries(["places", "skins", "shapes", "general", "largest", "joints", "view", "lens", "skew", "size", "tinted"]
-      .map((name) => [name, gl.getUniformLocation(this.program, name)]));
+    this.at = Object.fromEntries(["places", "skins", "shapes", "harmonics", "degree", "tone", "eye", "general", "largest", "joints", "view", "lens",
+      "skew", "size", "tinted"].map((name) => [name, gl.getUniformLocation(this.program, name)]));
     gl.uniform1i(this.at.places, 0);
     gl.uniform1i(this.at.skins, 1);
     gl.uniform1i(this.at.shapes, 2);
+    gl.uniform1i(this.at.harmonics, 3);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
   }
 
   // `avatar`: count, rest [3n], bones [4n], weights [4n], colours [3n], labels [n]; scales [n] of circles, or shapes
-  // [8n] of general ones, as the shader has them
+  // [8n] of general ones, as the shader has them; degree, harmonics [3Kn] above it, tone [3] as the shader has it
   load(avatar) {
     const { gl } = this;
     this.avatar = avatar;
@@ -138,10 +159,10 @@ class Splats {
       skins[4 * i + 1] = four(...avatar.weights.subarray(4 * i, 4 * i + 4));
       skins[4 * i + 2] = four(...avatar.colours.subarray(3 * i, 3 * i + 3), avatar.labels[i]);
     }
-    const texture = (unit, inner, format, kind, data, width = ROW) => {
+    const texture = (unit, inner, format, kind, data, width = ROW, height = rows) => {
       gl.activeTexture(gl.TEXTURE0 + unit);
       gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
-      gl.texImage2D(gl.TEXTURE_2D, 0, inner, width, rows, 0, format, kind, data);
+      gl.texImage2D(gl.TEXTURE_2D, 0, inner, width, height, 0, format, kind, data);
       gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
       gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
     };
@@ -150,6 +171,12 @@ class Splats {
     const shapes = new Float32Array(avatar.shapes ? 8 * ROW * rows : 8 * rows); // never empty: a shader asks for it
     if (avatar.shapes) shapes.set(avatar.shapes);
     texture(2, gl.RGBA32F, gl.RGBA, gl.FLOAT, shapes, avatar.shapes ? 2 * ROW : 2);
+    const above = avatar.harmonics.length / 3;
+    const shades = new Uint8Array(4 * ROW * Math.max(1, Math.ceil(above / ROW)));
+    for (let i = 0; i < above; i++) shades.set(avatar.harmonics.subarray(3 * i, 3 * i + 3), 4 * i);
+    texture(3, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, shades, ROW, shades.length / 4 / ROW);
+    gl.uniform1i(this.at.degree, avatar.degree);
+    gl.uniform3fv(this.at.tone, avatar.tone);
     gl.uniform1i(this.at.general, avatar.shapes ? 1 : 0);
     gl.uniform1f(this.at.largest, avatar.shapes ? ALPHA_MAX.general : ALPHA_MAX.opaque);
     this.order = new Uint32Array(avatar.count);
@@ -174,6 +201,7 @@ class Splats {
     gl.uniform4fv(at.joints, joints);
     const { R, t } = camera;
     gl.uniform4fv(at.view, [R[0], R[1], R[2], t[0], R[3], R[4], R[5], t[1], R[6], R[7], R[8], t[2]]);
+    gl.uniform3fv(at.eye, [0, 1, 2].map((k) => -(R[k] * t[0] + R[3 + k] * t[1] + R[6 + k] * t[2])));
     gl.uniform4f(at.lens, camera.fx, camera.fy, camera.cx, camera.cy);
     gl.uniform1f(at.skew, camera.skew);
     gl.uniform2f(at.size, camera.width, camera.height);
@@ -258,8 +286,9 @@ function turned(m, p) {
   return [0, 1, 2].map((i) => m[3 * i] * p[0] + m[3 * i + 1] * p[1] + m[3 * i + 2] * p[2]);
 }
 
-// [12 × 24] rows that take points at rest to the posed world: SMPL's kinematic chain. `rotations` [24][9], local.
-function chain(rotations, joints, parents, transl) {
+// [12 × 24] rows that take points at rest to the posed world: SMPL's kinematic chain. `rotations` [24][9], local;
+// `beyond` [288] or null: what the method adds, M - 1 and s of each joint, which first takes x to J + M (x - J) + s.
+function chain(rotations, joints, parents, transl, beyond) {
   const world = [];
   const out = new Float32Array(12 * JOINTS);
   for (let j = 0; j < JOINTS; j++) {
@@ -268,9 +297,11 @@ function chain(rotations, joints, parents, transl) {
     const step = parent < 0 ? joints[j] : turned(world[parent].R, joints[j].map((v, k) => v - joints[parent][k]));
     const t = parent < 0 ? step : step.map((v, k) => v + world[parent].t[k]);
     world.push({ R, t });
-    const moved = turned(R, joints[j]);
+    const own = beyond && [0, 1, 2].map((i) => [...beyond.subarray(12 * j + 4 * i, 12 * j + 4 * i + 4)]);
+    const L = own ? times(R, own.flatMap((row, i) => [0, 1, 2].map((k) => row[k] + Number(i === k)))) : R;
+    const shift = own ? turned(R, own.map((row) => row[3])) : [0, 0, 0], moved = turned(L, joints[j]);
     for (let i = 0; i < 3; i++) {
-      out.set([R[3 * i], R[3 * i + 1], R[3 * i + 2], t[i] - moved[i] + transl[i]], 12 * j + 4 * i);
+      out.set([L[3 * i], L[3 * i + 1], L[3 * i + 2], t[i] + shift[i] - moved[i] + transl[i]], 12 * j + 4 * i);
     }
   }
   return out;
@@ -293,16 +324,16 @@ function turnedBy(x, y, z) {
 }
 
 async function unpacked(about) {
-  const [own, skin] = await Promise.all([inflated(about.own), inflated(about.skin)]);
-  const n = about.count;
+  const [own, skin, moves] = await Promise.all([about.own, about.skin, about.corrected?.file].map((name) => name && inflated(name)));
+  const n = about.count, above = (about.degree + 1) ** 2 - 1;
   const narrow = (data, at) => {
     const out = new Uint8Array(n);
     for (let i = 0, v = 0; i < n; i++) out[i] = v = (v + data[at + i]) & 255;
     return out;
   };
-  const wide = (data, at) => {
-    const out = new Uint16Array(n);
-    for (let i = 0, v = 0; i < n; i++) out[i] = v = (v + data[at + i] + 256 * data[at + n + i]) & 65535;
+  const wide = (data, at, count = n) => {
+    const out = new Uint16Array(count);
+    for (let i = 0, v = 0; i < count; i++) out[i] = v = (v + data[at + i] + 256 * data[at + count + i]) & 65535;
     return out;
   };
   const together = (planes) => {
@@ -331,8 +362,12 @@ async function unpacked(about) {
       shapes.set([entry(0, 0), entry(0, 1), entry(0, 2), entry(1, 1), entry(1, 2), entry(2, 2), opacities[i] / 255, 0], 8 * i);
     }
   } else scales = Float32Array.from(wides(1)[0], length);
+  const samples = moves ? moves.length / 2 / 12 / JOINTS : 0;
   return {
-    count: n, rest, scales, shapes, colours: together(narrows(3)), labels: narrows(1)[0],
+    count: n, rest, scales, shapes, colours: together(narrows(3)), labels: narrows(1)[0], harmonics: together(narrows(3 * above)),
+    degree: about.degree, tone: [about.colours[0], about.colours[1] - about.colours[0], about.reach],
+    // of each of 288 numbers all samples
+    corrections: samples ? { ...about.corrected, samples, levels: new Int16Array(wide(moves, 0, moves.length / 2).buffer) } : null,
     bones: together([0, 1, 2, 3].map((k) => narrow(skin, k * n))), weights: together([4, 5, 6, 7].map((k) => narrow(skin, k * n))),
     joints: about.joints,
   };
