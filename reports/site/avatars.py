@@ -76,7 +76,7 @@ class BakedAvatar:
         """[N, 3, 4] rest to world; `correction` [24, 3, 4] as `corrections.corrected` takes it."""
         own = BodyPose(body_pose.pose, self.betas, body_pose.transl)
         transforms = corrected(body.joint_transforms(own)[:, :3], correction, self.joints)
-        return np.tensordot(self.whole_weights, transforms, 1)
+        return np.asarray(np.tensordot(self.whole_weights, transforms, 1), np.float64)
 
     def means(self, body: Body, body_pose: BodyPose, correction: Array | None = None) -> Array:
         """[N, 3] m, world."""

@@ -77,7 +77,8 @@ def bake(subject: Subject, poses: Sequence[BodyPose], seen: Visibility | None) -
     drawn = [d if kept.all() else _some(d, kept) for d in drawn]
     bones, rounded = _four(_weights(avatar, body, betas, first, draw)[kept])
     whole, joints = spread_weights(bones, rounded), body.shaped(betas)[1]
-    opacities = None if first.opacities is None else np.mean([d.opacities for d in drawn], 0)
+    seen_through = [d.opacities for d in drawn if d.opacities is not None]
+    opacities = np.asarray(np.mean(seen_through, 0)) if seen_through else None
 
     def transforms(pose: BodyPose) -> Array:
         return body.joint_transforms(BodyPose(pose.pose, betas, pose.transl))[:, :3]
@@ -155,7 +156,7 @@ def _drawable(drawn: _Drawn) -> NDArray[np.bool_]:
     """[N]: finite, and not too transparent to be drawn at all."""
     count = len(drawn.means)
     parts = [drawn.means, drawn.scales.reshape(count, -1), drawn.colours.reshape(count, -1)]
-    kept = np.isfinite(np.column_stack(parts)).all(1)
+    kept = np.asarray(np.isfinite(np.column_stack(parts)).all(1), bool)
     if drawn.opacities is not None:
         kept &= np.rint(np.nan_to_num(drawn.opacities) * LEVELS8) >= 1
     return kept

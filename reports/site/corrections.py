@@ -78,7 +78,7 @@ class Corrector:
         centred = np.concatenate([turn, at_joints[:, :, None]], 2)
         left = means[self._some] - self._design @ centred.transpose(0, 2, 1).reshape(-1, 3)
         added = (self._solver @ left).reshape(JOINTS, 4, 3).transpose(0, 2, 1)
-        own = np.linalg.solve(turn, centred + added)
+        own = np.asarray(np.linalg.solve(turn, centred + added), np.float64)
         own[:, :, 3] -= np.linalg.solve(turn, at_joints[:, :, None])[:, :, 0]
         return own
 
