@@ -20,6 +20,7 @@ WIDTH = 80
 NARROWEST = 40
 NAME = 18  # columns that a row's name gets at least
 GAP = 2
+COSTS = ("fit s", "render ms")
 SHOWN = 6  # pictures, and runs that are not done, that are named one by one
 
 
@@ -71,8 +72,8 @@ def headline_section(results: Sequence[RunResult]) -> list[Block]:
         own = [run.own for run in runs]
         identities = [i for i in dict.fromkeys(i for means in own for i in means) if i.region == headline]
         present = [i for i in identities if any(i in means and not means[i].absent for means in own)]
-        head = ("method", *(i.display.head() for i in present), "fit s")
-        rows = tuple((name, *cells) for name, cells in _rows(runs, present))
+        head = ("method", *(i.display.head() for i in present), COSTS[0])
+        rows = tuple((name, *cells[:-1]) for name, cells in _rows(runs, present))  # the others are below it
         scenes = sorted({run.scene for run in runs})
         note = (
             f"{protocol}, {profile} profile, {data}; region {headline}, mean over test views of {', '.join(scenes)}."
@@ -96,11 +97,13 @@ def _group(runs: Sequence[RunResult], width: int, not_run: Sequence[str]) -> lis
     without = dict.fromkeys([*(run.method for run in runs), *not_run])
     without = [method for method in without if not any(run.method == method for run in done)]
     bounds = next((k for k, (name, _) in enumerate(rows) if name in ROWS), len(rows))
-    rows[bounds:bounds] = [(method, ["—"] * (len(present) + 1)) for method in without]
-    heads = [i.display.head() for i in present] + ["fit s"]
+    rows[bounds:bounds] = [(method, ["—"] * len(present) + ["—", ""]) for method in without]
+    heads = [i.display.head() for i in present] + list(COSTS)
     table = [(visible(name), cells) for name, cells in [(f"region {headline}", heads), *rows]]
     sizes = [max(cell_len(cells[k]) for _, cells in table) for k in range(len(heads))]
     kept = list(range(len(heads)))
+    if not any(cells[-1] for _, cells in rows) or NAME + sum(sizes[k] + GAP for k in kept) > width:
+        kept.pop()  # first what drawing takes
     while len(kept) > 1 and NAME + sum(sizes[k] + GAP for k in kept) > width:
         kept.pop(-2)  # the last metric; the seconds stay
     room = width - sum(sizes[k] + GAP for k in kept)
@@ -110,7 +113,7 @@ def _group(runs: Sequence[RunResult], width: int, not_run: Sequence[str]) -> lis
         for name, cells in table
     ]
     absent = [i.display.title for i in in_headline if i not in present]
-    absent += [heads[k] for k in range(len(heads)) if k not in kept]
+    absent += [heads[k] for k in range(len(present)) if k not in kept]
     scenes = sorted({run.scene for run in done})
     note = f"mean over test views of {', '.join(scenes) if len(scenes) <= SHOWN else f'{len(scenes)} scenes'}"
     note += f"; not shown: {', '.join(absent)}" if absent else ""
@@ -126,13 +129,21 @@ def _rows(done: Sequence[RunResult], identities: Sequence[Identity]) -> list[tup
     rows = []
     for label, group in by_label(done).items():
         method = group[0].method
-        known = [run.fit_seconds for run in group if run.timed]
-        fit = f"{sum(known) / len(known):.0f}" if known and one_clock(group) else "—"
-        rows.append((label, [*score_cells(group, identities, method), fit]))
+        rows.append((label, [*score_cells(group, identities, method), *_costs(group)]))
         further = further_rows(group)
-        rows += [(label + row.removeprefix(method), [*score_cells(group, identities, row), ""]) for row in further]
+        for row in further:
+            rows.append((label + row.removeprefix(method), [*score_cells(group, identities, row), "", ""]))
     bounds = [row for row in ROWS if any(row in run.rows for run in done)]
-    return [*rows, *((row, [*score_cells(done, identities, row), ""]) for row in bounds)]
+    return [*rows, *((row, [*score_cells(done, identities, row), "", ""]) for row in bounds)]
+
+
+def _costs(runs: Sequence[RunResult]) -> list[str]:
+    """Of `COSTS`: "—" for seconds that have no mean, nothing for milliseconds of which there are none."""
+    seconds = [run.fit_seconds for run in runs if run.timed]
+    drawing = [ms for run in runs if (ms := run.about.render_ms) is not None]
+    alike = one_clock(runs)
+    fit = f"{sum(seconds) / len(seconds):.0f}" if seconds and alike else "—"
+    return [fit, f"{sum(drawing) / len(drawing):.3g}" if drawing and alike else ""]
 
 
 def _cut(name: str, room: int) -> str:

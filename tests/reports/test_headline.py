@@ -30,6 +30,18 @@ def test_methods_come_first_then_what_bounds_them():
     assert lines[-1].endswith("--full")
 
 
+def test_what_drawing_takes_is_shown_where_there_is_room():
+    runs = [fake_run(k, psnr=20.0, said={"render_ms": ms}) for k, ms in (("a", 100.0), ("b", 25.5))]
+    runs.append(fake_run("a", "other", psnr=19.0))
+    lines = lines_of(*runs)
+    assert lines[2].split()[-4:] == ["fit", "s", "render", "ms"]
+    assert lines[4].split() == ["ours", "20.00", "0.9000", "10", "62.8"]
+    assert lines[5].split() == ["other", "19.00", "0.9000", "10"]
+    (head,) = (line for line in lines_of(*runs, width=46) if line.startswith("region"))
+    assert head.split()[-2:] == ["fit", "s"]
+    assert "SSIM" in head  # it goes before a metric does
+
+
 def test_a_page_begins_with_the_same_tables():
     runs = [fake_run("a", psnr=20.0), fake_run("b", psnr=21.0), fake_run("c", status="failed", reason="fell")]
     heading, note, table = headline_section(runs)
