@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -68,6 +68,16 @@ def write_files(path: Path, files: Mapping[str, bytes]) -> Path:
     for suffix, data in files.items():
         write_bytes(path.parent / f"{path.name}{suffix}", data)
     return path.parent / f"{path.name}{next(iter(files))}"
+
+
+def remove_old(folder: Path, ours: Callable[[str], bool]) -> None:
+    """Remove files that the bench wrote into this folder under such names, and that nobody has edited since."""
+    with _alone(folder):
+        written = _written(folder)
+        for name, digests in sorted(written.items()):
+            path = folder / name
+            if ours(name) and not path.is_symlink() and _hash(path) in digests:
+                removal.discard_file(path)
 
 
 def check(folder: Path, names: Iterable[str]) -> None:

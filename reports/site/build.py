@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from ihbench.reports.site.tables import site_tables
 from ihbench.version import __version__
 
 LARGEST_FILE = 25 * 2**20  # bytes of a single file: browsers open 32 MB by double click, and mail takes 25
+PICTURE = re.compile(r"[0-9a-f]{16}\.(webp|png)")  # what `frames.Files` calls them
 TITLE = "ihbench: occluded people, rebuilt"
 
 
@@ -53,13 +55,15 @@ def build(
 
 
 def write_folder(site: Site, folder: Path) -> Path:
-    """`index.html` and the pictures beside it. Returns the page's path. Raises `BadInput` where somebody else's file
-    of such a name is there."""
+    """`index.html` and the pictures beside it; pictures of an earlier site there go. Returns the page's path. Raises
+    `BadInput` where somebody else's file of such a name is there."""
     outputs.check(folder, ["index.html"])
     for name, content in site.files.items():
         outputs.write_bytes(folder / "files" / name, content, durable=False)
     index = folder / "index.html"
     outputs.write_text(index, site.html())
+    if (folder / "files").is_dir():
+        outputs.remove_old(folder / "files", lambda name: bool(PICTURE.fullmatch(name)) and name not in site.files)
     return index
 
 

@@ -75,6 +75,7 @@ def _group(runs: Sequence[RunResult], done: Sequence[RunResult], numbers: Mappin
         if any(i in run.own and not run.own[i].absent for run in done)
     ]
     absent = {str(i): run.own[i].reason for run in done for i in run.own if i not in identities and run.own[i].reason}
+    common = _common([{run.scene for run in row} for row in by_label(done).values()])
     return {
         "protocol": protocol,
         "digest": digest,
@@ -84,44 +85,61 @@ def _group(runs: Sequence[RunResult], done: Sequence[RunResult], numbers: Mappin
         "headline": next((run.headline for run in done), ""),
         "identities": [{"name": str(i), "metric": i.metric, "region": i.region} for i in identities],
         "absent": absent,
-        "rows": _rows(done, identities, numbers),
+        "common": common,
+        "rows": _rows(done, identities, numbers, common),
         "runs": [numbers[id(run)] for run in runs],
         "toml": toml(runs[0].about.protocol or {}),
     }
 
 
-def _rows(done: Sequence[RunResult], identities: Sequence[Identity], numbers: Mapping[int, int]) -> list[Json]:
-    """Methods' rows, with those of further groups of test views below them, then the calibration rows."""
+def _common(scenes: Sequence[set[str]]) -> list[str] | None:
+    """The scenes that every method has; None where all have the same."""
+    if all(of == scenes[0] for of in scenes):
+        return None
+    return sorted(set.intersection(*scenes))
+
+
+def _rows(
+    done: Sequence[RunResult], identities: Sequence[Identity], numbers: Mapping[int, int], common: list[str] | None
+) -> list[Json]:
+    """Methods' rows, with those of further groups of test views below them, then the calibration rows. Where methods
+    have other scenes, each row has its means over the scenes that all have, too, and the marks are of these."""
     labelled = by_label(done)
     rows: list[Json] = []
-    marks = _marks(labelled, identities)
+    marks = _marks({label: _on(runs, common) for label, runs in labelled.items()}, identities)
     for label, runs in labelled.items():
         for name in (runs[0].method, *further_rows(runs)):
             own = name == runs[0].method
-            row = _row(label + name.removeprefix(runs[0].method), runs, identities, name, numbers)
+            row = _row(label + name.removeprefix(runs[0].method), runs, identities, name, numbers, common)
             rows.append(row | {"kind": "method" if own else "further", "marks": marks[label] if own else {}})
     for name in ROWS:
         if having := [run for run in done if name in run.rows]:
-            row = _row(name, having, identities, name, numbers)
+            row = _row(name, having, identities, name, numbers, common)
             rows.append(row | {"kind": "bound", "marks": {}, "about": DESCRIPTIONS[name], "fit": None, "total": None})
     return rows
 
 
+def _on(runs: Sequence[RunResult], common: list[str] | None) -> list[RunResult]:
+    return [run for run in runs if common is None or run.scene in common]
+
+
 def _row(
-    label: str, runs: Sequence[RunResult], identities: Sequence[Identity], name: str, numbers: Mapping[int, int]
+    label: str,
+    runs: Sequence[RunResult],
+    identities: Sequence[Identity],
+    name: str,
+    numbers: Mapping[int, int],
+    common: list[str] | None,
 ) -> Json:
-    means, intervals, scenes = {}, {}, {}
-    for i in identities:
-        found = scene_means(runs, i, name)
-        if not found:
-            continue
-        means[str(i)] = number(macro_mean(found).value)
-        scenes[str(i)] = {scene: number(mean.value) for scene, mean in found.items()}
-        finite = {scene: mean.value for scene, mean in found.items() if math.isfinite(mean.value)}
-        if len(finite) > 1:
-            interval = mean_interval(finite, LEVEL)
-            if math.isfinite(interval.low):
-                intervals[str(i)] = [interval.low, interval.high]
+    scenes = {
+        str(i): {scene: number(mean.value) for scene, mean in found.items()}
+        for i in identities
+        if (found := scene_means(runs, i, name))
+    }
+    means, intervals = _means(runs, identities, name)
+    shared = {}
+    if common is not None:
+        shared["common"], shared["common_intervals"] = _means(_on(runs, common), identities, name)
     seconds = {
         key: [value for run in runs if (value := getattr(run.about, f"{key}_seconds")) is not None]
         for key in ("fit", "total")
@@ -137,9 +155,26 @@ def _row(
         "means": means,
         "by_scene": scenes,
         "intervals": intervals,
+        **shared,
         **{key: sum(found) / len(found) if found and alike else None for key, found in seconds.items()},
         "peak": max((run.about.peak_mb or 0.0 for run in runs), default=0.0),
     }
+
+
+def _means(runs: Sequence[RunResult], identities: Sequence[Identity], name: str) -> tuple[Json, Json]:
+    """Identity -> mean over test views, then scenes; and its interval over scenes, where there is one."""
+    means, intervals = {}, {}
+    for i in identities:
+        found = scene_means(runs, i, name)
+        if not found:
+            continue
+        means[str(i)] = number(macro_mean(found).value)
+        finite = {scene: mean.value for scene, mean in found.items() if math.isfinite(mean.value)}
+        if len(finite) > 1:
+            interval = mean_interval(finite, LEVEL)
+            if math.isfinite(interval.low):
+                intervals[str(i)] = [interval.low, interval.high]
+    return means, intervals
 
 
 def _marks(labelled: Mapping[str, Sequence[RunResult]], identities: Sequence[Identity]) -> dict[str, Json]:

@@ -7,6 +7,7 @@ import shutil
 import threading
 import tomllib
 import zlib
+from dataclasses import replace
 from http.server import ThreadingHTTPServer
 from types import SimpleNamespace
 
@@ -94,6 +95,27 @@ def test_every_number_is_the_runs_own(page, results):
     assert any("lpips" in name for name in group["absent"])
     assert tomllib.loads(group["toml"])["occlusion"]["rule"] == results[0].about.protocol["occlusion"]["rule"]
     assert data["left_out"] == ["a folder: was damaged"]
+
+
+def test_methods_with_other_scenes_are_compared_over_what_all_have():
+    scores = {
+        ("a", "ours"): 20.0,
+        ("b", "ours"): 22.0,
+        ("c", "ours"): 40.0,
+        ("a", "other"): 21.0,
+        ("b", "other"): 23.0,
+    }
+    runs = [fake_runs.fake_run(scene, method, psnr=psnr) for (scene, method), psnr in scores.items()]
+    (group,) = tables.site_tables(runs)["groups"]
+    assert group["common"] == ["a", "b"]
+    rows = {row["label"]: row for row in group["rows"]}
+    name = next(i["name"] for i in group["identities"] if i["metric"] == "psnr")
+    assert [rows[m]["means"][name] for m in ("ours", "other")] == pytest.approx([82 / 3, 22.0])
+    assert [rows[m]["common"][name] for m in ("ours", "other")] == pytest.approx([21.0, 22.0])
+    assert rows["ours"]["scenes"] == ["a", "b", "c"]
+    assert [rows[m]["marks"].get(name) for m in ("ours", "other")] == [None, "best"]  # of what both have
+    assert tables.site_tables(runs[:2] + runs[3:])["groups"][0]["common"] is None
+    assert tables.site_tables([runs[2], *runs[3:]])["groups"][0]["common"] == []
 
 
 def test_what_a_protocol_says_survives_as_toml():
@@ -388,6 +410,18 @@ def test_a_folder_keeps_what_is_somebody_elses(site, tmp_path):
     assert (tmp_path / "theirs" / "index.html").read_text() == "mine"
     names = {name for name in Page(index.read_text()).inside if name.startswith("file-")}
     assert names == {f"file-{name}" for name in site.carried}  # pictures lie beside it, avatars do not
+
+
+def test_pictures_of_an_earlier_site_go(site, tmp_path):
+    files = build.write_folder(site, tmp_path).parent / "files"
+    names = sorted(site.files)
+    (files / names[0]).write_bytes(b"edited by its user")
+    (files / "0123456789abcdef.webp").write_bytes(b"a user's, whose name looks like ours")
+    (files / "notes.txt").write_text("a user's")
+    other = replace(site, files={name: site.files[name] for name in names[3:]})
+    build.write_folder(other, tmp_path)
+    left = {file.name for file in files.iterdir() if not file.name.startswith(".")}
+    assert left == {names[0], "0123456789abcdef.webp", "notes.txt", *names[3:]}
 
 
 def test_one_file_has_a_limit(site, tmp_path, monkeypatch):

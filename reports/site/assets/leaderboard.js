@@ -1,6 +1,14 @@
 // The table of a group: rows by method, sortable; every number leads to the test views that it is the mean of.
 
-const board = { metrics: null, regions: null, sort: null, down: true, open: null };
+const board = { metrics: null, regions: null, sort: null, down: true, open: null, shared: true };
+
+// Means over the scenes that every method has, where they have others and unless all of each one's own are asked for.
+function limited(group) {
+  return board.shared && group.common?.length > 0;
+}
+function meansOf(group, row) {
+  return limited(group) ? row.common : row.means;
+}
 
 function leaderboardTab(group) {
   const metrics = [...new Set(group.identities.map((i) => i.metric))];
@@ -19,6 +27,10 @@ function leaderboardTab(group) {
     el("div", { class: "bar" }, chips(metrics, board.metrics, "metrics"), chips(regions, board.regions, "regions"),
       el("div", { class: "chips" }, ["CSV", "Markdown", "LaTeX"].map((form) =>
         button(`copy ${form}`, (event) => copied(asText(group, columns, form), event.target), { class: "quiet" })))),
+    group.common && el("p", { class: "note warning" }, group.common.length
+      ? `The methods have other scenes. ${board.shared ? "Compared" : "Could be compared"} over what all have: ${group.common.join(", ")}. `
+      : "No scene has every method: each mean is over its own scenes, and they do not compare. ",
+      group.common.length > 0 && toggle("only scenes that all have", board.shared, (on) => { board.shared = on; show(); })),
     el("div", { class: "wide" }, boardTable(group, columns)),
     el("p", { class: "note" },
       `Mean over test views of a scene, then over scenes. Headline region: ${group.headline}. Brackets: 95% interval `
@@ -34,7 +46,7 @@ function leaderboardTab(group) {
 function sortedRows(group) {
   if (board.sort === null) return group.rows;
   const key = (row) => {
-    const value = board.sort in row ? row[board.sort] : row.means[board.sort];
+    const value = board.sort in row ? row[board.sort] : meansOf(group, row)[board.sort];
     return board.sort === "label" ? row.label : real(value);
   };
   const sign = board.down ? -1 : 1;
@@ -65,19 +77,23 @@ function boardTable(group, columns) {
   const body = sortedRows(group).map((row) => el("tr", { class: row.kind },
     el("th", { scope: "row", title: row.about ?? "" }, row.label,
       row.seeds.length > 1 && el("small", {}, ` ${row.seeds.length} seeds`)),
-    el("td", {}, String(row.scenes.length)),
-    columns.map((i) => scoreCell(row, i)),
+    el("td", { title: scenesOf(group, row).join(", ") }, String(scenesOf(group, row).length)),
+    columns.map((i) => scoreCell(group, row, i)),
     el("td", {}, row.kind === "method" ? seconds(row.fit) : ""),
     el("td", {}, row.kind === "method" ? seconds(row.total) : ""),
     el("td", {}, row.kind === "method" ? row.peak.toFixed(0) : "")));
   return el("table", { class: "board" }, el("thead", {}, head), el("tbody", {}, body));
 }
 
-function scoreCell(row, identity) {
-  const value = row.means[identity.name];
+function scenesOf(group, row) {
+  return limited(group) ? row.scenes.filter((scene) => group.common.includes(scene)) : row.scenes;
+}
+
+function scoreCell(group, row, identity) {
+  const value = meansOf(group, row)[identity.name];
   const metric = DATA.metrics[identity.metric];
   const text = value === undefined ? "—" : shown(value, metric);
-  const interval = row.intervals[identity.name];
+  const interval = (limited(group) ? row.common_intervals : row.intervals)[identity.name];
   const about = `${identity.name} = ${value ?? "absent"}`;
   const inner = [el("span", { class: row.marks[identity.name] ?? "" }, text),
     interval && interval[0] < interval[1] && el("small", {}, ` [${interval.map((v) => shown(v, metric)).join(", ")}]`)];
@@ -124,9 +140,9 @@ function unfinished(group) {
 function asText(group, columns, form) {
   const head = ["method", "scenes", ...columns.map((i) => titled(i.name)), "fit s", "total s"];
   const lines = sortedRows(group).map((row) => [
-    row.label, String(row.scenes.length),
+    row.label, String(scenesOf(group, row).length),
     ...columns.map((i) => {
-      const value = row.means[i.name];
+      const value = meansOf(group, row)[i.name];
       if (form === "CSV") return String(value ?? "");
       const text = value === undefined ? "—" : shown(value, DATA.metrics[i.metric]);
       const mark = row.marks[i.name];
