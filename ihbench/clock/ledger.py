@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypedDict
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypedDict
 
 from ihbench.clock import interruption, machine
 from ihbench.clock.checkpoints import States, Tensors, Words, state_file
@@ -37,6 +37,16 @@ Megabytes = Annotated[float, Within(0, nan=True)]  # NaN where the system does n
 _PART = r"[A-Za-z0-9][A-Za-z0-9 _.+-]{0,99}"
 StagePath = Annotated[str, TextRule("a stage", re.compile(rf"{_PART}(/{_PART}){{0,9}}").fullmatch)]
 OnCheckpoint = Callable[[int, float, Any], None]
+
+
+class Watcher(Protocol):
+    """Somebody who looks on while a fit goes on: see `runner.snapshots`."""
+
+    def due(self) -> bool:
+        """Asked at every step: whether to show the avatar now."""
+        ...
+
+    def take(self, step: int, seconds: float, avatar: Any) -> None: ...
 
 
 @dataclass
@@ -107,6 +117,7 @@ class Ledger:
         state: LedgerState | None = None,
         on_checkpoint: OnCheckpoint | None = None,
         on_event: Callable[[Event], None] | None = None,  # of each, as it happens
+        watcher: Watcher | None = None,
         quality_times: QualityTimes = QualityTimes(),
         save_every: float = 20.0,  # s, the least time between two saved states
         clock: Callable[[], float] = time.perf_counter,
@@ -114,7 +125,7 @@ class Ledger:
         self._folder = None if folder is None else Path(folder)
         self._states = States(self._folder)
         self.device = device
-        self.on_checkpoint, self.on_event = on_checkpoint, on_event
+        self.on_checkpoint, self.on_event, self.watcher = on_checkpoint, on_event, watcher
         self.quality_times = quality_times
         self.save_every = save_every
         self.events: list[Event] = []
@@ -125,6 +136,7 @@ class Ledger:
         self._chain: tuple[str, ...] = ()  # open stages, outermost first
         self._loaded_clock: float | None = None  # the latest fit clock among the states loaded
         self._offered_step: int | None = None
+        self._shown_step: int | None = None
         if state is not None:
             self._stages = {path: replace(stage) for path, stage in state.stages.items()}
             self._total, self._total_cpu = state.seconds, state.cpu_seconds
@@ -227,16 +239,24 @@ class Ledger:
         until the avatar is scored.
         """
         interruption.check()
+        if self.watcher is not None and step != self._shown_step and self.watcher.due():
+            self._show(step, avatar)
         if self.on_checkpoint is None or (step == self._offered_step if force else self.fit_seconds < self._due):
             return False
         machine.synchronize(self.device)
         seconds = self.fit_seconds
         with self.paused(), progress.task(f"scoring step {step}") if progress is not None else nullcontext():
-            made = avatar if hasattr(avatar, "render") or not callable(avatar) else avatar()
-            self.on_checkpoint(step, seconds, made)
+            self.on_checkpoint(step, seconds, _made(avatar))
         self._offered_step = step
         self._due = self.quality_times.after(seconds)
         return True
+
+    def _show(self, step: int, avatar: Any) -> None:
+        assert self.watcher is not None
+        seconds = self.fit_seconds
+        with self.paused():
+            self.watcher.take(step, seconds, _made(avatar))
+        self._shown_step = step
 
     # --- resume ---
 
@@ -397,3 +417,8 @@ def _stages(record: Mapping[str, Any]) -> dict[str, Stage]:
 
 def _root(path: str) -> str:
     return path.partition("/")[0]
+
+
+def _made(avatar: Any) -> Any:
+    """An avatar, of one or of what makes one."""
+    return avatar if hasattr(avatar, "render") or not callable(avatar) else avatar()

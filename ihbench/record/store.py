@@ -67,6 +67,7 @@ WRITTEN = {
     SEQUENCE: {".ply"},
     "avatar": {".safetensors", ".json", ".npz", ".npy", ".pt", ".pth", ".bin"},
     "checkpoints": {".safetensors"},
+    "live": {".safetensors", ".json", ".npz", ".npy", ".pt", ".pth", ".bin"},  # snapshots while somebody watches
     "presets": {".jsonl"},
     "renders": {".png"},  # of a number
 }  # fmt: skip

@@ -35,6 +35,7 @@ from ihbench.record.source_digest import code_of, shipped_digest
 from ihbench.record.store import RunFolder, is_finished
 from ihbench.runner.recorded_run import RecordedRun, about_scene, identity_of, recorded
 from ihbench.runner.score_stage import ScoreStage
+from ihbench.runner.snapshots import Snapshots
 from ihbench.scene.contracts import Avatar, Capture, TestView
 from ihbench.scene.data_source import DataSource
 from ihbench.scene.method_spec import method_spec
@@ -120,13 +121,13 @@ def run_identity(request: RunRequest, capture: Capture, body: Body) -> RunIdenti
     return identity_of(request.protocol, capture, body, request.method, config, request.seed, code)
 
 
-def load_avatar(run: FinishedRun, device: str = "cpu") -> Any:
-    """The avatar of a run. Raises `BadInput` where it has none."""
-    if not (run.folder / "avatar").is_dir():
+def load_avatar(run: FinishedRun, device: str = "cpu", folder: Path | None = None) -> Any:
+    """The avatar of a run, or a snapshot of it in another folder. Raises `BadInput` where it has none."""
+    if not (folder or run.folder / "avatar").is_dir():
         raise BadInput(f"{run.folder}: has no avatar (status {run.record.outcome.status}); finish the run first")
     identity = run.record.identity
     spec = method_spec(identity.method)
-    return spec.create(spec.profile(identity.profile)).load(run.folder / "avatar", run.body, device)
+    return spec.create(spec.profile(identity.profile)).load(folder or run.folder / "avatar", run.body, device)
 
 
 class RenderClock:
@@ -163,6 +164,7 @@ class _Run(RecordedRun):
         before: Mapping[str, tuple[float, float]],  # s, wall and CPU, that opening the scene took
     ):
         super().__init__(folder, progress, request.device, self._curve_point)
+        self.snapshots = self.ledger.watcher = Snapshots(folder.path)
         for stage, clocks in before.items():
             self.ledger.book(stage, *clocks)
         self.request, self.occluded, self.capture, self.body = request, scene, scene.capture, body
@@ -202,6 +204,7 @@ class _Run(RecordedRun):
             )
         with self.ledger.stage("save"), self.folder.saving_avatar():
             avatar.save(self.folder.path / "avatar")
+        self.snapshots.end()
         self.folder.set_status("running", ledger=self.ledger)
         with self.ledger.stage("score"):
             clock = RenderClock()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,11 +32,12 @@ class Subject:
 
     run: FinishedRun
     device: str = "cpu"
+    snapshot: Path | None = None  # folder of another avatar of this run, saved while it was fitted
 
     @cached_property
     def avatar(self) -> Any:
         """A `scene.contracts.Avatar`."""
-        return load_avatar(self.run, self.device)
+        return load_avatar(self.run, self.device, self.snapshot)
 
     @cached_property
     def body(self) -> Body:

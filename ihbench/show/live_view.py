@@ -1,0 +1,164 @@
+"""A fit while it goes on, in the browser: snapshots of the running run in a viser scene on this machine alone.
+
+viser (the extra `view`) draws the Gaussians of avatars that have them, and a textured mesh of others. Its splats are
+those of files (`export.splat_cloud`): colours of no direction, widened by a training image's pixel.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from ihbench import registry
+from ihbench.body.canonical import canonical_pose
+from ihbench.body.pose import BodyPose
+from ihbench.clock.progress import Progress
+from ihbench.errors import BadInput
+from ihbench.export.files import Exporter
+from ihbench.record.finished_run import FinishedRun
+from ihbench.show.following import Following, Seen
+from ihbench.show.motion import find_motion, stand_of
+from ihbench.show.subject import Subject
+
+HOST = "127.0.0.1"
+EVERY = 1.0  # s between two looks at the run
+REST = "a_pose"
+FPS = 15.0
+AVATAR = "/avatar"  # in the scene
+TEXTURE = 256  # texels of a mesh's texture: it is made anew for every snapshot
+
+
+def viser_or_why() -> ModuleType:
+    """viser. Raises `BadInput` where it is not installed."""
+    try:
+        import viser
+    except ImportError as error:
+        raise BadInput("--live needs viser, which is not installed: pip install 'ihbench[view]'") from error
+    return viser
+
+
+class LiveView:
+    """The page: what is new is loaded, posed as the page's controls say, and drawn."""
+
+    def __init__(self, server: Any, following: Following, data: Path | None = None, body: Path | None = None):
+        self.server, self.following = server, following
+        self._data, self._body = data, body
+        self._run: FinishedRun | None = None
+        self._blur: float | None = None  # m, of its images' pixels
+        self._subject: Subject | None = None
+        self._changed = False
+        self._handle: Any = None
+        server.scene.set_up_direction("+y")
+        self._words = server.gui.add_markdown("Waiting for the first snapshot of a run.")
+        motions = registry.names("motion")
+        self._motion = server.gui.add_dropdown("pose", (REST, *motions), initial_value=REST)
+        self._time = server.gui.add_slider("time", min=0.0, max=1.0, step=0.01, initial_value=0.0)
+        for control in (self._motion, self._time):
+            control.on_update(self._ask_again)
+
+    def _ask_again(self, _: object) -> None:
+        self._changed = True
+
+    def look(self) -> Seen | None:
+        """Show what is new, if anything, and pose again what the page's controls have moved."""
+        seen = self.following.look()
+        if seen is not None and (subject := self._loaded(seen)) is not None:
+            self._subject, self._changed = subject, True
+            self._words.content = f"**{seen.run.name}**: {seen.words}"
+        if self.following.fault:
+            self._words.content = self.following.fault
+        if self._changed and self._subject is not None:
+            self._changed = False
+            self._draw(self._subject)
+        return seen
+
+    def _loaded(self, seen: Seen) -> Subject | None:
+        """None where the run has begun to write over it: the next one will come."""
+        if self._run is None or self._run.folder != seen.run:
+            self._run, self._blur = FinishedRun(seen.run, self._data, self._body), None
+        subject = Subject(self._run, snapshot=seen.folder)
+        try:
+            whole = subject.avatar is not None and seen.still_there
+        except (BadInput, OSError):
+            if seen.number is None:
+                raise
+            return None
+        return subject if whole else None
+
+    def _pose(self, subject: Subject) -> BodyPose:
+        if self._motion.value == REST:
+            return BodyPose(canonical_pose(REST), subject.betas, np.zeros(3))
+        motion = find_motion(self._motion.value, FPS, subject.body, subject.betas)
+        return motion.body_poses(subject.betas)[min(int(self._time.value * len(motion)), len(motion) - 1)]
+
+    def _draw(self, subject: Subject) -> None:
+        pose, exporter = self._pose(subject), Exporter(subject, Progress.silent(), side=TEXTURE, footprint=self._blur)
+        self._blur = exporter.blur
+        if hasattr(subject.avatar, "posed_gaussians"):
+            stand = stand_of(subject.body, BodyPose(canonical_pose(REST), subject.betas, np.zeros(3)), _UP)
+            cloud = exporter.cloud(pose, "y-up", stand)
+            factors = _axes(cloud.quaternions) * cloud.scales[:, None, :]
+            self._handle = self.server.scene.add_gaussian_splats(
+                AVATAR,
+                cloud.means.astype(np.float32),
+                (factors @ factors.transpose(0, 2, 1)).astype(np.float32),
+                np.rint(cloud.colors * 255).astype(np.uint8),
+                cloud.opacities[:, None].astype(np.float32),
+            )
+        else:
+            self._handle = self.server.scene.add_glb(AVATAR, exporter.skinned_glb(REST, []))
+
+
+_UP = np.array([0.0, 1.0, 0.0])
+
+
+def _axes(quaternions: Any) -> Any:
+    """[N, 3, 3] of quaternions [N, 4], w first."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_quat(quaternions[:, [1, 2, 3, 0]]).as_matrix()
+
+
+def serve_live(
+    places: Sequence[Path],
+    port: int,
+    say: Callable[[str], None],
+    data: Path | None = None,
+    body: Path | None = None,
+    goes_on: Callable[[], bool] = lambda: True,
+) -> None:
+    """Serve on the loopback address until interrupted, or until `goes_on` says no. Raises `BadInput` without viser,
+    and for a port that cannot be had."""
+    viser = viser_or_why()
+    server = viser.ViserServer(host=HOST, port=port or _free_port(), label="ihbench", verbose=False)
+    try:
+        here = server.get_port()
+        if port and here != port:
+            raise BadInput(f"--port {port}: is taken; name another, or 0 for any that is free")
+        say(f"http://{HOST}:{here}/  (from elsewhere: ssh -L {here}:{HOST}:{here} THIS_MACHINE; Ctrl-C ends it)")
+        view, last = LiveView(server, Following(places), data, body), ""
+        while goes_on():
+            seen = None
+            with suppress(FileNotFoundError):  # a run folder that goes away: the next look will not find it
+                seen = view.look()
+            words = f"{seen.run.name}: {seen.words}" if seen is not None else view.following.fault
+            if words and words != last:
+                say(words)
+                last = words
+            time.sleep(EVERY)
+    finally:
+        server.stop()
+
+
+def _free_port() -> int:
+    import socket
+
+    with socket.socket() as probe:
+        probe.bind((HOST, 0))
+        return int(probe.getsockname()[1])
