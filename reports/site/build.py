@@ -101,3 +101,24 @@ def serve(
         return build(results, left_out, views=views, title=title, progress=progress, scenes=scenes, pictures=pictures)
 
     serve_followed(Followed(read, make), port, progress.say)
+
+
+def need_viser() -> None:
+    """Raise `BadInput` where viser, which `serve_live` needs, is not installed."""
+    from ihbench.reports.site.live_view import viser_or_why
+
+    viser_or_why()
+
+
+def serve_live(
+    places: Sequence[Path],
+    port: int,
+    *,
+    data: Path | None = None,
+    body: Path | None = None,
+    goes_on: Callable[[], bool] = lambda: True,
+) -> None:
+    """See `live_view.serve_live`."""
+    from ihbench.reports.site import live_view
+
+    live_view.serve_live(places, port, Progress().say, data, body, goes_on)

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -66,20 +66,18 @@ def _divided(argv: Sequence[str]) -> tuple[list[str], bool, list[str]]:
 
 
 def _live(chosen: ViewOptions, to_run: Sequence[str] | None) -> int:
-    from ihbench.clock.progress import Progress
-    from ihbench.show.live_view import serve_live, viser_or_why
-
-    viser_or_why()  # before anything is run
-    say = Progress().say
+    site = registry.load("site", "general")
+    site.need_viser()  # before anything is run
     if to_run is None:
         if missing := [place for place in chosen.runs if not place.is_dir()]:
             raise BadInput(f"{missing[0]}: no such folder; name run folders, or where ihbench run puts them")
-        serve_live(chosen.runs, chosen.port, say, chosen.data, chosen.body)
+        site.serve_live(chosen.runs, chosen.port, data=chosen.data, body=chosen.body)
         return 0
     places = [_runs_of(to_run)]
     with subprocess.Popen([sys.executable, "-m", "ihbench", "run", *to_run]) as child:
         try:
-            serve_live(places, chosen.port, say, chosen.data, chosen.body, goes_on=lambda: child.poll() in (None, 0))
+            more: dict[str, Any] = {"data": chosen.data, "body": chosen.body}
+            site.serve_live(places, chosen.port, **more, goes_on=lambda: child.poll() in (None, 0))
         finally:
             if child.poll() is None:
                 child.terminate()  # it saves what it has; a Ctrl-C has reached it already

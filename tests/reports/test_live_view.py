@@ -142,7 +142,7 @@ def test_without_viser_one_line_names_the_extra(bench, finished, monkeypatch):
 
 def test_gaussians_reach_the_scene(bench, finished, tmp_path):
     viser = pytest.importorskip("viser", reason="viser (extra `view`) is not installed")
-    from ihbench.show.live_view import HOST, LiveView, _free_port
+    from ihbench.reports.site.live_view import HOST, LiveView, _free_port
 
     server = viser.ViserServer(host=HOST, port=_free_port(), verbose=False)
     try:
