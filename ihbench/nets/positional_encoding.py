@@ -1,4 +1,5 @@
-"""Sines and cosines of a position, as NeRF gives it to its networks (Mildenhall et al. 2020, sec. 5.1)."""
+"""Sines and cosines of a position, as NeRF gives it to its networks (Mildenhall et al. 2020, sec. 5.1), and with
+bands that come on during a fit."""
 
 from __future__ import annotations
 
@@ -17,3 +18,23 @@ def positional_encoding(
     octaves = 2.0 ** torch.arange(frequencies, dtype=points.dtype, device=points.device)
     flat = (points[:, :, None] * (first * octaves)).reshape(len(points), 3 * frequencies)
     return torch.cat([points, flat.sin(), flat.cos()], 1)
+
+
+def band_window(
+    progress: float,  # bands that are on; at or beyond `frequencies` all are
+    frequencies: int,
+) -> Tensor:
+    """[F] in [0, 1]: bands come on one after the other, each along half a cosine (BARF; HumanNeRF,
+    embedders/hannw_fourier.py:26-41)."""
+    share = (progress - torch.arange(frequencies, dtype=torch.float64)).clamp(0, 1)
+    return ((1 - torch.cos(math.pi * share)) / 2).float()
+
+
+def windowed_encoding(
+    points: Tensor,  # [N, 3] m
+    window: Tensor,  # [F]
+    first: float = 1.0,  # rad/m
+) -> Tensor:
+    """[N, 6 F]: sines, then cosines, each band times its window; without the points themselves."""
+    encoded = positional_encoding(points, len(window), first)[:, 3:]
+    return encoded * window.to(points).repeat(6)
