@@ -1,0 +1,1 @@
+"""What radiance fields share when they are fitted: targets, patches, marching, the fit step by step."""
