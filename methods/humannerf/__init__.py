@@ -1,0 +1,1 @@
+"""HumanNeRF (Weng, Curless, Srinivasan, Barron, Kemelmacher-Shlizerman, CVPR 2022)."""

@@ -1,0 +1,47 @@
+"""HumanNeRF as a registered method."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ihbench.body import Body
+from ihbench.clock.events import Warned
+from ihbench.clock.ledger import Ledger
+from ihbench.clock.progress import Progress
+from ihbench.errors import BadInput
+from ihbench.methods.humannerf.avatar import HumanNerfAvatar
+from ihbench.methods.humannerf.config import HumanNerfConfig
+from ihbench.methods.humannerf.fitting import HumanNerfFit
+from ihbench.scene.contracts import TrainingSet
+
+SAME_BETAS = 1e-3  # a shape coefficient that varies less over the frames is the same
+
+
+class HumanNerfMethod:
+    """A radiance field in the T-pose fitted to the training views in one go."""
+
+    def __init__(self, config: HumanNerfConfig):
+        self.config = config
+
+    def fit(
+        self, training: TrainingSet, *, device: str, seed: int, ledger: Ledger, progress: Progress
+    ) -> HumanNerfAvatar:
+        """Fit one person. See `scene.contracts.Method`. Raises `BadInput` without a view that shows the person, and
+        `Diverged` also where every start ends in an empty picture."""
+        if not len(training.views):
+            raise BadInput(f"scene {training.name}: no training view; nothing to fit")
+        with ledger.stage("fit/prepare"):
+            betas = np.array([view.body_pose.betas for view in training.views])
+            if np.ptp(betas, axis=0).max(initial=0) > SAME_BETAS:
+                ledger.event_once(Warned("shape coefficients vary over the frames; the T-pose has their mean"))
+            avatar = HumanNerfAvatar(self.config, training.body, betas.mean(0), seed).to(device)
+            fit = HumanNerfFit(avatar, training, seed, ledger)
+        with ledger.stage("fit/field"):
+            fit.run(progress)
+        return avatar
+
+    def load(self, folder: Path, body: Body, device: str = "cpu") -> HumanNerfAvatar:
+        """Read an avatar written by `HumanNerfAvatar.save`."""
+        return HumanNerfAvatar.load(folder, body, device)

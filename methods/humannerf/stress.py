@@ -1,0 +1,91 @@
+"""Stiff training of HumanNeRF: what is asked of every such fit (`stress.fit_cases`), both ways to take hidden pixels,
+shapes that differ by frame, fits that stay empty, and a kill. Named in the spec."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ihbench.clock.ledger import Ledger
+from ihbench.clock.progress import Progress
+from ihbench.methods.humannerf.config import SMOKE, HumanNerfConfig, in_steps
+from ihbench.methods.humannerf.method import HumanNerfMethod
+from ihbench.scene.contracts import TrainingSet
+from ihbench.stress.case import Answer
+from ihbench.stress.fit_cases import STEP, FitCases
+from ihbench.stress.resuming import changed_by_a_kill
+from ihbench.stress.six_views import training_set, views, with_bad_hidden_pixels
+
+# whole pictures, so that a bad pixel is met; every part is on before the end
+TINY = replace(
+    in_steps(SMOKE, 18),
+    depth=4,
+    width=32,
+    bands=5,
+    samples=32,
+    patches=1,
+    patch_px=48,
+    lpips=0.0,
+    mse=1.0,
+    kick_in=5,
+    full_band=12,
+)
+RATES = ("lr", "lr_motion", "lr_non_rigid", "lr_poses")
+
+
+def fit(config: HumanNerfConfig, training: TrainingSet, ledger: Ledger) -> Any:
+    return HumanNerfMethod(config).fit(training, device="cpu", seed=0, ledger=ledger, progress=Progress.silent())
+
+
+def start(config: HumanNerfConfig, training: TrainingSet) -> Any:
+    """The avatar that a fit begins with."""
+    from ihbench.methods.humannerf.avatar import HumanNerfAvatar
+
+    return HumanNerfAvatar(config, training.body, training.views[0].body_pose.betas, 0)
+
+
+def _other_shapes() -> Answer:
+    """Shape coefficients that differ by frame: one T-pose, with their mean."""
+    shown = [
+        replace(view, body_pose=replace(view.body_pose, betas=np.array([0.5 * (-1) ** k, 0.0])))
+        for k, view in enumerate(views())
+    ]
+    return OURS.ratio(TINY, training_set(shown))
+
+
+def _empty() -> Answer:
+    """Nobody is on the person's pixels and nobody may be: the fit starts again, and ends as a divergence."""
+    config = replace(TINY, on_person=0.0, lr=0.3, guard=(6,))
+    shown = [replace(view, mask=np.where(np.arange(view.mask.size).reshape(view.mask.shape) == view.mask.argmax(),
+             view.mask, 0).astype(np.uint8)) for view in views()]  # fmt: skip
+    return Answer(OURS.story(config, training_set(shown))[1], "new starts")
+
+
+def _resumed() -> Answer:
+    """Killed with all parts on, and gone on with: the same bits as without."""
+    from ihbench.methods.humannerf.fitting import HumanNerfFit
+
+    training = training_set()
+    whole, _ = OURS.story(TINY, training)
+    assert whole is not None
+    changed = changed_by_a_kill(
+        lambda: start(TINY, training), lambda avatar, ledger: HumanNerfFit(avatar, training, 0, ledger), whole
+    )
+    return Answer(changed, 0)
+
+
+OURS = FitCases("humannerf", TINY, RATES, fit, start)
+IGNORING = replace(TINY, unknown="ignore")
+CASES = [
+    *OURS.usual(TINY, TINY, None),
+    OURS.helps("empty-mask-ignored", "two frames without a visible pixel, hidden pixels are ignored",
+               lambda: OURS.empty_masks(IGNORING)),
+    OURS.helps("nan-hidden-ignored", "NaN behind the occluder, hidden pixels are ignored",
+               lambda: OURS.ratio(IGNORING, with_bad_hidden_pixels(1, math.nan))),
+    OURS.helps("other-shapes", "shape coefficients that differ by frame", _other_shapes),
+    OURS.case("empty", "everything is background", _empty, "words", STEP),
+    OURS.case("resumed", "killed and gone on with", _resumed, "absolute", "what continues is the same fit"),
+]  # fmt: skip
