@@ -148,7 +148,7 @@ ON_A_CPU = HumanNerfConfig(
 )
 
 PAPER = HumanNerfConfig()
-QUICK = in_steps(ON_A_CPU, 600)
+QUICK = in_steps(ON_A_CPU, 400)
 SMOKE = replace(
     in_steps(ON_A_CPU, 40),
     depth=4,
