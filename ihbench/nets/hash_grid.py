@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-PRIMES = (1, 2_654_435_761, 805_459_861)
+PRIMES = (1, 2_654_435_761, 805_459_861, 3_674_653_429)  # of the axes; the fourth as in torch-ngp
 LARGEST_START = 1e-4  # of the first values, as in tiny-cuda-nn
 ROWS_ALIGNED = 8  # a dense level's rows are a multiple of this
 
@@ -32,6 +32,9 @@ u64, f32 = np.uint64, np.float32
 class HashGrid(nn.Module):
     """[N, 3] in 0..1 → [N, levels · features]. Positions outside are moved onto the border and get no gradient
     there; one that is not a number counts as 0."""
+
+    dimensions = 3
+    spare_corners = 0  # along a side of each lattice, that no position reaches
 
     scales: Tensor  # [L] float32 cells along a side
     sides: Tensor  # [L] int64 corners along a side
@@ -57,9 +60,10 @@ class HashGrid(nn.Module):
             )
         growth = (finest / coarsest) ** (1 / max(levels - 1, 1))
         scales = np.array([coarsest * growth**level - 1 for level in range(levels)], np.float32)
-        sides = np.ceil(scales).astype(np.int64) + 1
+        sides = np.ceil(scales).astype(np.int64) + 1 + self.spare_corners
         most = 2**log2_size
-        rows = np.minimum(-(-(sides**3) // ROWS_ALIGNED) * ROWS_ALIGNED, most)
+        corners = np.minimum(sides.astype(float) ** self.dimensions, 2.0**31).astype(np.int64)
+        rows = np.minimum(-(-corners // ROWS_ALIGNED) * ROWS_ALIGNED, most)
         starts = np.concatenate([[0], np.cumsum(rows)])
         for name, value in (("scales", scales), ("sides", sides), ("starts", starts)):
             self.register_buffer(name, torch.from_numpy(value), persistent=False)
@@ -83,28 +87,26 @@ class HashGrid(nn.Module):
 
 
 def features_by_torch(
-    points: Tensor,  # [N, 3] in 0..1
+    points: Tensor,  # [N, D] in 0..1
     table: Tensor,  # [R, F]
     scales: Tensor,  # [L]
     sides: Tensor,  # [L]
     starts: Tensor,  # [L + 1]
 ) -> Tensor:
-    """[N, L F] in the table's dtype: what the compiled loops do, as tensors."""
-    places = points.nan_to_num(nan=0.0).clamp(0, 1)
-    corners = torch.tensor([[k & 1, k >> 1 & 1, k >> 2 & 1] for k in range(8)], device=points.device)
+    """[N, L F] in the table's dtype, for D up to four: what the compiled loops do, as tensors."""
+    places, axes = points.nan_to_num(nan=0.0).clamp(0, 1), range(points.shape[1])
+    corners = torch.tensor([[k >> axis & 1 for axis in axes] for k in range(2 ** len(axes))], device=points.device)
     levels = []
     for level, side in enumerate(sides.tolist()):
         start, end = starts[level].item(), starts[level + 1].item()
         lattice = places * scales[level].to(places.dtype) + 0.5
         cell = lattice.detach().floor()
         share = (lattice - cell)[:, None, :]
-        corner = cell.long()[:, None, :] + corners  # [N, 8, 3]
-        if side**3 <= end - start:
-            row = corner[..., 0] + side * (corner[..., 1] + side * corner[..., 2])
-        else:
-            x, y, z = (corner[..., axis] * prime for axis, prime in enumerate(PRIMES))
-            row = x ^ y ^ z
-        weight = torch.where(corners > 0, share, 1 - share).prod(-1)  # [N, 8]
+        corner = cell.long()[:, None, :] + corners  # [N, 2^D, D]
+        dense, row = side ** len(axes) <= end - start, torch.zeros_like(corner[..., 0])
+        for axis in axes:
+            row = row + corner[..., axis] * side**axis if dense else row ^ (corner[..., axis] * PRIMES[axis])
+        weight = torch.where(corners > 0, share, 1 - share).prod(-1)  # [N, 2^D]
         levels.append((table[start + row % (end - start)] * weight[..., None].to(table.dtype)).sum(1))
     return torch.cat(levels, 1)
 
