@@ -35,10 +35,11 @@ class CanonicalSurface(nn.Module):
     low: Tensor  # [3] m, corner of the canonical box
     high: Tensor  # [3] m
 
-    def __init__(self, body: Body, betas: Array, seed: int):
+    def __init__(self, body: Body, betas: Array, seed: int, cell: float = 0.0):
         """Raises `BadInput` for shape coefficients that the body does not have, `ValueError` for fewer than ten
         vertices."""
         super().__init__()
+        self.cell = cell  # m: see `NearestVertices`
         vertices, joints = body.shaped(betas)
         if len(vertices) < NEIGHBOURS:
             raise ValueError(f"body: expected at least {NEIGHBOURS} vertices, got {len(vertices)}")
@@ -68,30 +69,36 @@ class CanonicalSurface(nn.Module):
         self,
         places: Tensor,  # [M, 3] m
     ) -> Tensor:
-        """[M, 40] int64: the ten nearest vertices of all, then of each coarser subset. Without gradient."""
-        vertices = self._points()
-        parts = [_search(vertices.tobytes(), NEIGHBOURS)(places)]
-        for level in range(1, LEVELS):
-            subset = self.subset(level)
-            near = _search(vertices[subset.cpu().numpy()].tobytes(), NEIGHBOURS)(places)
-            parts.append(subset.to(near.device)[near])
-        return torch.cat(parts, 1)
+        """[M, 40] int32: the ten nearest vertices of all, then of each coarser subset. Without gradient."""
+        subsets = tuple(self.subset(level).cpu().numpy().tobytes() for level in range(1, LEVELS))
+        corners = [tuple(each.tolist()) for each in (self.low, self.high)]
+        return _search(self._points().tobytes(), subsets, NEIGHBOURS, *corners, self.cell)(places)
 
     def nearest_three(
         self,
         places: Tensor,  # [M, 3] m
     ) -> Tensor:
-        """[M, 3] int64: the nearest vertices of all."""
-        return _search(self._points().tobytes(), NEIGHBOURS)(places)[:, :OF_A_VERTEX]
+        """[M, 3] int32: the nearest vertices of all, exactly."""
+        corners = [tuple(each.tolist()) for each in (self.low, self.high)]
+        return _search(self._points().tobytes(), (), OF_A_VERTEX, *corners, 0.0)(places)
 
     def _points(self) -> NDArray[np.float32]:
         return self.vertices.cpu().numpy().astype(np.float32)
 
 
-@lru_cache(maxsize=8)  # two people's: their lists are 30 MB, and take seconds to make
-def _search(points: bytes, count: int) -> NearestVertices:
-    """Of float32 points, shared by every avatar that has the same ones."""
-    return NearestVertices(np.frombuffer(points, np.float32).reshape(-1, 3), count)
+@lru_cache(maxsize=4)  # two people's: a table has up to 80 MB, and takes seconds to fill
+def _search(
+    points: bytes,  # float32 [V, 3]
+    subsets: tuple[bytes, ...],  # int64
+    count: int,
+    low: tuple[float, float, float],
+    high: tuple[float, float, float],
+    cell: float,
+) -> NearestVertices:
+    """Shared by every avatar that has the same surface."""
+    where = np.frombuffer(points, np.float32).reshape(-1, 3)
+    sets = [np.arange(len(where)), *(np.frombuffer(each, np.int64) for each in subsets)]
+    return NearestVertices(where, sets, count, (np.array(low, np.float32), np.array(high, np.float32)), cell)
 
 
 def vertex_normals(
@@ -115,10 +122,12 @@ def farthest_points(
     """[count] numbers of points, each the farthest from all before it; the first is `start`. Any beginning of them
     is the farthest-point subset of its size."""
     chosen = np.empty(count, np.int64)
+    centered = points - points.mean(0)
+    square = np.square(centered).sum(1)
     apart = np.full(len(points), np.inf)
     at = start
     for k in range(count):
         chosen[k] = at
-        np.minimum(apart, np.square(points - points[at]).sum(1), out=apart)
+        np.minimum(apart, square - 2 * (centered @ centered[at]) + square[at], out=apart)
         at = int(apart.argmax())
     return chosen

@@ -1,8 +1,8 @@
 """The completeness prior: density inside the body costs nothing, none there costs ten.
 
 As released (tiangexiang/OccNeRF 1cb1ef3, network.py:486-499, trainer.py:167-186): the mean over all samples of
-rays of 10 · [inside] · exp(clip(-relu(σ), -10, 0)), σ before its activation. Where σ is not above 0, or 10 and more, there is
-no gradient.
+rays of 10 · [inside] · exp(clip(-relu(σ), -10, 0)), σ before its activation. Where σ is not above 0, or 10 and more,
+there is no gradient.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 from ihbench.methods.occnerf.canonical_surface import CanonicalSurface, farthest_points, vertex_normals
 from ihbench.methods.occnerf.completeness import completeness, sample_costs
 from ihbench.methods.occnerf.decoder import SurfaceDecoder
-from ihbench.methods.occnerf.nearest_vertices import REACH, NearestVertices, nearest_by_torch
+from ihbench.methods.occnerf.nearest_vertices import NearestVertices, nearest_by_torch
 from ihbench.methods.occnerf.projection import grid_place, projected, signed_distance
 from ihbench.methods.occnerf.visibility import count_seen, ends_of_rays, neighbour_weights
 from tests.bench.fake_capture import the_body
@@ -199,7 +199,6 @@ def test_coarser_sets_are_farthest_point_subsets():
 def test_the_neighbours_are_the_ten_nearest_of_each_set():
     rng = np.random.default_rng(3)
     places = BODY.v_template[rng.integers(len(BODY.v_template), size=400)] + rng.normal(0, 0.04, (400, 3))
-    places[:5] += 10 * REACH  # beyond the lattice
     places = places.astype(np.float32)
     near = surface().neighbours(torch.from_numpy(places))
     vertices = surface().vertices.numpy()
@@ -213,15 +212,46 @@ def test_the_neighbours_are_the_ten_nearest_of_each_set():
     assert torch.equal(surface().nearest_three(torch.from_numpy(places)), near[:, :3])
 
 
-def test_the_search_is_its_twin_and_takes_few_points_and_bad_places():
+def test_cells_share_the_neighbours_of_their_centre():
+    """A place at a centre has its own ten nearest; others of the cell the same ones; on a body, places within 4 cm of
+    the surface keep nine of ten of the nearest vertices with cells of 1 cm, and nearly all of the coarser sets'."""
     rng = np.random.default_rng(4)
+    points = rng.uniform(-0.1, 0.1, (60, 3)).astype(np.float32)
+    box = np.full(3, -0.2, np.float32), np.full(3, 0.2, np.float32)
+    shared = NearestVertices(points, [np.arange(60)], 7, box, cell=0.05)
+    center = torch.tensor([[-0.175, 0.025, 0.075]])
+    own = KDTree(points).query(center.numpy(), 7)[1]
+    assert shared(center).tolist() == own.tolist()
+    assert shared(center + torch.tensor([[0.02, -0.02, 0.02]])).tolist() == own.tolist()
+    outside = shared(torch.tensor([[9.0, 0.0, 0.0], [math.nan, 0.0, 0.0], [math.inf, 0.0, 0.0]]))
+    assert ((outside >= 0) & (outside < 60)).all()
+    coarse = CanonicalSurface(BODY, np.zeros(10), 0, cell=0.01)
+    places = surface().vertices[::20] + torch.from_numpy(rng.normal(0, 0.04, (427, 3)).astype(np.float32))
+    exact, near = surface().neighbours(places), coarse.neighbours(places)
+    kept = [
+        np.mean([np.isin(a, b).mean() for a, b in zip(exact[:, k : k + 10], near[:, k : k + 10], strict=True)])
+        for k in (0, 10, 20, 30)
+    ]
+    assert kept[0] > 0.87
+    assert kept == sorted(kept)
+    assert kept[3] > 0.97
+    assert torch.equal(coarse.neighbours(places), near), "filled once"
+
+
+def test_the_search_is_its_twin_and_takes_few_places_and_bad_ones():
+    rng = np.random.default_rng(5)
     points = rng.uniform(-0.1, 0.1, (40, 3)).astype(np.float32)
+    sets = [np.arange(40), np.arange(0, 40, 2)]
+    box = np.full(3, -1, np.float32), np.full(3, 1, np.float32)
+    search = NearestVertices(points, sets, 7, box, cell=0)
     places = torch.from_numpy(rng.uniform(-0.5, 0.5, (200, 3)).astype(np.float32))
-    assert torch.equal(NearestVertices(points, 7)(places), nearest_by_torch(places, torch.from_numpy(points), 7))
-    assert NearestVertices(points[:4], 10)(places).sort(1).values.unique(dim=0).tolist() == [[0, 1, 2, 3]]
-    assert NearestVertices(points, 3)(places[:0]).shape == (0, 3)
-    bad = NearestVertices(points, 3)(torch.tensor([[math.nan, 0, 0], [math.inf, 0, 0]]))
-    assert ((bad >= 0) & (bad < 40)).all()
+    given = nearest_by_torch(places, torch.from_numpy(points), [torch.from_numpy(each) for each in sets], 7)
+    assert torch.equal(search(places), given)
+    assert (given[:, 7:] % 2 == 0).all()
+    assert search(places[:0]).shape == nearest_by_torch(places[:0], places, [given[0]] * 2, 7).shape == (0, 14)
+    assert ((search(torch.full((1, 3), math.nan)) >= 0) & (search(torch.full((1, 3), math.inf)) < 40)).all()
+    with pytest.raises(ValueError, match="cells"):
+        NearestVertices(points, sets, 7, box, cell=1e-4)
 
 
 # ------------------------------------------------------------------------------------------------- the networks
@@ -234,8 +264,8 @@ def test_the_released_networks():
     assert products == [230_656, 230_912]
     assert all(not layer.bias.any() for part in (decoder.density, decoder.color) for layer in part)
     hidden, last = decoder.density[1].weight, decoder.density[-1].weight
-    assert float(hidden.std()) == pytest.approx(math.sqrt(2 * 2 / 512), rel=0.02)
-    assert float(last.std()) == pytest.approx(math.sqrt(2 / (256 + 65)), rel=0.03)
+    assert hidden.std().item() == pytest.approx(math.sqrt(2 * 2 / 512), rel=0.02)
+    assert last.std().item() == pytest.approx(math.sqrt(2 / (256 + 65)), rel=0.03)
     raw, rgb = decoder(torch.zeros(2, 35), torch.zeros(2), torch.zeros(2, 32))
     assert raw.tolist() == [0, 0]
     assert (rgb == 0.5).all()

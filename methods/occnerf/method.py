@@ -1,0 +1,46 @@
+"""OccNeRF as a registered method (Xiang, Sun, Wu, Adeli, Fei-Fei, ICCV 2023)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ihbench.body import Body
+from ihbench.clock.events import Warned
+from ihbench.clock.ledger import Ledger
+from ihbench.clock.progress import Progress
+from ihbench.errors import BadInput
+from ihbench.methods.occnerf.avatar import OccNerfAvatar
+from ihbench.methods.occnerf.config import OccNerfConfig
+from ihbench.methods.occnerf.fitting import OccNerfFit
+from ihbench.scene.contracts import TrainingSet
+
+SAME_BETAS = 1e-3  # a shape coefficient that varies less over the frames is the same
+
+
+class OccNerf:
+    """Surface features, networks and motion weights fitted to patches of the training views in one go."""
+
+    def __init__(self, config: OccNerfConfig):
+        self.config = config
+
+    def fit(
+        self, training: TrainingSet, *, device: str, seed: int, ledger: Ledger, progress: Progress
+    ) -> OccNerfAvatar:
+        """Fit one person. See `scene.contracts.Method`. Raises `BadInput` without a view that shows the person."""
+        if not len(training.views):
+            raise BadInput(f"scene {training.name}: no training view; nothing to fit")
+        with ledger.stage("fit/prepare"):
+            betas = np.array([view.body_pose.betas for view in training.views])
+            if np.ptp(betas, axis=0).max(initial=0) > SAME_BETAS:
+                ledger.event_once(Warned("shape coefficients vary over the frames; the T-pose has their mean"))
+            avatar = OccNerfAvatar(self.config, training.body, betas.mean(0), seed).to(device)
+            fit = OccNerfFit(avatar, training, seed, ledger)
+        with ledger.stage("fit/field"):
+            fit.run(progress)
+        return avatar
+
+    def load(self, folder: Path, body: Body, device: str = "cpu") -> OccNerfAvatar:
+        """Read an avatar written by `OccNerfAvatar.save`."""
+        return OccNerfAvatar.load(folder, body, device)
