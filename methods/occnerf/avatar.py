@@ -16,14 +16,15 @@ from ihbench.camera import Camera
 from ihbench.config_fields import read
 from ihbench.fit.avatar_files import read_avatar, write_avatar
 from ihbench.fit.decoded_cache import DecodedCache
+from ihbench.fit.rays.ray_target import PosedBox
 from ihbench.methods.occnerf.canonical_surface import CanonicalSurface
 from ihbench.methods.occnerf.config import OccNerfConfig
 from ihbench.methods.occnerf.decoder import SurfaceDecoder
 from ihbench.methods.occnerf.field import PosedField, vertex_features
 from ihbench.nets.bone_lookups import BoneWeights
-from ihbench.nets.bone_maps import bone_maps, root_frame
+from ihbench.nets.bone_maps import bone_maps
 from ihbench.nets.hash_grid_4d import HashGrid4d
-from ihbench.nets.motion_weights import MotionWeightVolume, joint_box
+from ihbench.nets.motion_weights import MotionWeightVolume
 from ihbench.render.volumes.fast import Skipping, draw_image
 
 KIND = "occnerf"
@@ -83,16 +84,6 @@ class OccNerfAvatar(nn.Module):
         maps = bone_maps(rotations, joints, canonical, [int(p) for p in self.body.parents])
         return BoneWeights(volume, self.motion.low, self.motion.high, maps)
 
-    def posed_box(self, body_pose: BodyPose) -> tuple[Tensor, Tensor]:
-        """Corners [3] m of the person's box in the frame fixed to the root."""
-        own = self.body.shaped(body_pose.betas)[1]
-        R, t = root_frame(body_pose, own)
-        return joint_box(self._tensor(self.body.posed_joints(body_pose) @ R.T + t))
-
-    def frame(self, body_pose: BodyPose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """From the world to the frame fixed to the root: R [3, 3], t [3] m."""
-        return root_frame(body_pose, self.body.shaped(body_pose.betas)[1])
-
     def decode(self) -> tuple[Tensor, Tensor]:
         """What does not depend on the pose: motion weights [25, 32, 32, 32] and vertex features [V, 35]."""
         return self.motion(), vertex_features(self)
@@ -113,13 +104,14 @@ class OccNerfAvatar(nn.Module):
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """rgb [H, W, 3] on `background` and alpha [H, W]; see `scene.contracts.Avatar`. `frame` changes nothing."""
         volume, features = self._cache.get(self, self.counters.cpu().numpy().tobytes(), self.decode)
+        box = PosedBox.around(self.body, body_pose)
         drawn = draw_image(
             self.field(body_pose, volume, features),
             camera,
-            self.posed_box(body_pose),
+            box.ends(features.dtype, features.device),
             self.config.samples,
             background,
-            self.frame(body_pose),
+            box.frame,
             Skipping(least=self.config.least),
         )
         return drawn.rgb.clamp(0, 1).cpu().numpy(), drawn.alpha.clamp(0, 1).cpu().numpy()

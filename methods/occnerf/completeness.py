@@ -18,7 +18,7 @@ DENSE = 10.0  # of σ: solid enough
 
 @dataclass(frozen=True)
 class Completeness:
-    """The prior's value, its loss, split by where it comes from."""
+    """The prior's value, split by where it comes from."""
 
     body: Tensor  # scalar, from samples that are evaluated
     collapsed: Tensor  # scalar, from those that the warp drops onto the origin
@@ -41,11 +41,14 @@ def completeness(
     inside: Tensor,  # [M] bool
     samples: float,  # how many there are on all rays, evaluated or not
     origin: tuple[Tensor, Tensor] | None = None,  # σ and inside of the canonical origin, scalars
+    shares: Tensor | None = None,  # [M] of one of those samples that each evaluated one stands for; None: one each
 ) -> Completeness:
     """The mean over all samples. With `origin` those not evaluated count as lying there, as in the released code,
     which warps every place without motion weights to the canonical origin: inside the torso."""
-    body = sample_costs(sigma, inside).sum() / samples
+    costs = sample_costs(sigma, inside)
+    body = (costs if shares is None else costs * shares).sum() / max(samples, 1)
     if origin is None:
         return Completeness(body, torch.zeros_like(body))
-    skipped = max(samples - len(sigma), 0)
-    return Completeness(body, sample_costs(*origin) * (skipped / samples))
+    evaluated = len(sigma) if shares is None else float(shares.sum())
+    skipped = max(samples - evaluated, 0)
+    return Completeness(body, sample_costs(*origin) * (skipped / max(samples, 1)))

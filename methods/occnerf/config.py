@@ -5,16 +5,19 @@ Steps count from 1. What `paper` says is what was released for ZJU-MoCap.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated, Literal
 
 from ihbench.config_fields import STEPS, Within, check
+from ihbench.metrics.weights import FILES, locate
+from ihbench.scene.plan import Omission, SceneMeasure
 
 WEIGHT, RATE = Within(0, 1e6), Within(0, 1000)  # of a term of the loss; a learning rate
 COUNT = Within(1, 10_000)
 RELEASED_STEPS = 100_000
 DECAY_STEPS = 500_000  # over which released learning rates fall to a tenth
-PIXEL_FINEST = 2048  # corners along a side of the grid's finest lattice, in a metre of the bound
+COUNTING_SHARE = 0.02  # of a step's time, measured with the quick profile
 
 
 @dataclass(frozen=True)
@@ -69,12 +72,18 @@ class OccNerfConfig:
     """Trunk of LPIPS."""
     mse: Annotated[float, WEIGHT] = 0.2
     """Weight of the mean squared error on patches."""
+    stand_in: Literal["pyramid", "ssim", "l1"] = "ssim"
+    """What stands in for LPIPS where its trunk's weights are missing."""
     lr: Annotated[float, RATE] = 5e-4
-    """Adam's step size of networks and hash grid."""
+    """Adam's step size of both networks."""
+    lr_grid: Annotated[float, RATE] = 5e-4
+    """Adam's step size of the hash grid."""
     lr_displacement: Annotated[float, RATE] = 1e-4
     """Adam's step size of displacements in m."""
     lr_motion: Annotated[float, RATE] = 5e-5
     """Adam's step size of the motion weights."""
+    second_moment: Annotated[float, Within(0, 0.9999)] = 0.999
+    """Adam's decay of squared gradients."""
     decay_steps: Annotated[int, Within(1, 100 * STEPS)] = DECAY_STEPS
     """Steps in which all step sizes fall to a tenth."""
     clip: Annotated[float, Within(0, 1e9, above=True)] = 1.0
@@ -85,3 +94,56 @@ class OccNerfConfig:
 
 
 PAPER = OccNerfConfig()
+ON_A_CPU = replace(
+    PAPER,
+    patches=2,
+    refined=24,
+    least=5e-3,
+    neighbour_cell=0.01,
+    completeness="body",
+    levels=8,
+    hash_size=15,
+    hash_finest=512,
+    width=64,
+    depth=3,
+    decoder_code=64,
+    decoder_share=8,
+    second_moment=0.99,
+)
+QUICK = replace(ON_A_CPU, steps=400, decay_steps=400, lr=2e-3, lr_grid=1e-2, lr_motion=5e-4)
+SMOKE = replace(
+    ON_A_CPU,
+    steps=60,
+    patch_px=16,
+    samples=64,
+    refined=16,
+    levels=5,
+    hash_size=12,
+    hash_finest=128,
+    width=32,
+    depth=2,
+    decoder_code=32,
+    decoder_share=16,
+    neighbour_cell=0.02,
+    decay_steps=60,
+    lr=5e-3,
+    lr_grid=2e-2,
+    lr_motion=1e-3,
+)
+
+PROFILES = {"smoke": SMOKE, "quick": QUICK, "paper": PAPER}
+
+
+def leave_out(config: OccNerfConfig, scene: SceneMeasure) -> list[Omission]:
+    """What this scene does not need of this configuration (see `ihbench.scene.plan`)."""
+    if config.visibility and scene.hidden_share == 0 and scene.covered_views == 0:
+        reason = "no occluder: nothing is seen less often than what faces the camera less often"
+        return [Omission("visibility", False, reason, {"fit/field": COUNTING_SHARE})]
+    return []
+
+
+def outside_files(config: OccNerfConfig) -> list[Path]:
+    """Files whose content affects the answer: the trunk of LPIPS, in whose place another distance stands while the
+    file is not there."""
+    trunk = locate(FILES[f"lpips-{config.perceptual_net}"]) if config.perceptual > 0 else None
+    return [trunk] if isinstance(trunk, Path) else []

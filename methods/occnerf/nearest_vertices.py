@@ -1,8 +1,8 @@
 """Which vertices are near a place: looked up once for each cell of a lattice, or for each place by itself.
 
 The base points never move, so the places of a cell may share what is nearest to its centre. Distances and projections
-are computed from the place itself all the same (`projection`). A cell is filled when a place first falls into it; what
-it holds depends on nothing but the cell.
+are computed from the place itself all the same (`projection`). A cell is filled when a place first falls into it;
+what it holds depends on nothing but the cell.
 """
 
 from __future__ import annotations

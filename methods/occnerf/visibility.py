@@ -17,6 +17,8 @@ def neighbour_weights(
     counters: Tensor,  # [M, k] of each place's neighbours
 ) -> tuple[Tensor, Tensor]:
     """Weights [M, k] that sum to 1, and the unbiased variance [M] of the scaled counters. Without gradient."""
+    if not len(counters):
+        return counters.clone(), counters.new_zeros(0)
     above = counters - counters.amin(1, keepdim=True) + 1
     scaled = above / above.amax(1, keepdim=True)
     return scaled.softmax(1), scaled.var(1)
