@@ -27,7 +27,7 @@ def layers(inputs: int, width: int, depth: int, outputs: int, generator: torch.G
 
 def through(made: nn.ModuleList, x: Tensor) -> Tensor:
     for layer in made[:-1]:
-        x = layer(x).relu()
+        x = layer(x).relu_()
     return made[-1](x)
 
 

@@ -32,13 +32,13 @@ if TYPE_CHECKING:
     from ihbench.methods.occnerf.avatar import OccNerfAvatar
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SurfaceValues(FieldValues):
     """With what the completeness prior and the visibility counter look at."""
 
-    raw: Tensor | None = None  # [M] density before its law
-    inside: Tensor | None = None  # [M] bool: of the body
-    canonical: Tensor | None = None  # [M, 3] m
+    raw: Tensor  # [M] density before its law
+    inside: Tensor  # [M] bool: of the body
+    canonical: Tensor  # [M, 3] m
 
 
 def vertex_features(avatar: OccNerfAvatar) -> Tensor:
@@ -103,4 +103,5 @@ class PosedField:
             likelihood = likelihood.clamp(max=1)
         canonical = canonical.detach()
         found = decoded(self.avatar, self.features, canonical)
-        return SurfaceValues(found.rgb, softplus_density(found.raw), likelihood, found.raw, found.inside, canonical)
+        density = softplus_density(found.raw)
+        return SurfaceValues(found.rgb, density, likelihood, raw=found.raw, inside=found.inside, canonical=canonical)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import numpy as np
 import torch
@@ -140,10 +140,9 @@ class OccNerfFit(FieldOptimisation[OccNerfAvatar]):
     ) -> Completeness | None:
         """Over as many samples as the rays have between the faces of the box: those of a second pass, which lie
         closer, stand for less than one each."""
-        config, values = self.avatar.config, shown.marched.values
+        config, values = self.avatar.config, surface_values(shown)
         if config.completeness == "off":
             return None
-        assert isinstance(values, SurfaceValues) and values.raw is not None and values.inside is not None
         origin = None
         if config.completeness == "released":
             at = decoded(self.avatar, features, features.new_zeros(1, 3))
@@ -184,13 +183,17 @@ class OccNerfFit(FieldOptimisation[OccNerfAvatar]):
             )
 
 
+def surface_values(shown: MarchedPixels) -> SurfaceValues:
+    """What the field said of the samples that were evaluated."""
+    return cast("SurfaceValues", shown.marched.values)
+
+
 @torch.no_grad()
 def ending_vertices(avatar: OccNerfAvatar, shown: MarchedPixels) -> Tensor:
     """[N, 10] int64: of each ray that ends somewhere, the displaced vertices nearest to where it does."""
     from scipy.spatial import KDTree
 
-    marched, values = shown.marched, shown.marched.values
-    assert isinstance(values, SurfaceValues) and values.canonical is not None
+    marched, values = shown.marched, surface_values(shown)
     ends, at = ends_of_rays(marched.alpha, marched.composited.weights, shown.depths)
     place = torch.full_like(marched.active, -1, dtype=torch.int64)
     place[marched.active] = torch.arange(len(values.canonical), device=place.device)

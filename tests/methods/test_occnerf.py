@@ -14,6 +14,7 @@ from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput, Diverged
+from ihbench.fit.rays.marching import MarchedPixels
 from ihbench.fit.rays.ray_target import PosedBox
 from ihbench.methods.occnerf import fitting
 from ihbench.methods.occnerf.avatar import OccNerfAvatar
@@ -111,15 +112,12 @@ def test_check_3_the_vertices_nearest_to_where_a_ray_ends(views, raw, count):
     number = int(middle[1]) * SIZE + int(middle[0])
     field, rays, depths, lengths = seen_from_the_front(fit.avatar, np.array([number]), 64)
 
-    class Shown:
-        marched = march(field, rays, depths, lengths, 1e-3)
-
-    shown = Shown()
-    shown.depths = depths
+    marched = march(field, rays, depths, lengths, 1e-3)
+    shown = MarchedPixels(marched.composited.rgb, marched.composited.alpha, depths, rays, marched, torch.arange(1))
     near = ending_vertices(fit.avatar, shown)
     assert near.numel() == count
     if count:
-        alpha = Shown.marched.alpha[0]
+        alpha = marched.alpha[0]
         sample = int(alpha.argmax())
         place = rays.points(depths)[0, sample]
         canonical = field.bones.located(place[None])[1][0]
@@ -326,7 +324,9 @@ def test_the_prior_is_noted(views, monkeypatch):
 
 def test_released_rates_fall_and_everything_is_clipped_together(views):
     """.1^(it / 500 000): .631 at the released end; the norm of all gradients is 1 at most."""
-    fit = a_fit(training_set(views), completeness="released", completeness_weight=100.0, clip=1.0, decay_steps=500_000)
+    fit = a_fit(
+        training_set(views), completeness="released", completeness_weight=100.0, clip=1.0, decay_steps=500_000
+    )
     fit.step = 100_000
     assert fit._rate_share() == pytest.approx(0.631, abs=1e-3)
     fit.step = 0
