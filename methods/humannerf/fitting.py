@@ -6,17 +6,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ihbench.clock.events import LeftOut, Warned
+from ihbench.clock.events import Warned
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.errors import Diverged
-from ihbench.fit.losses import WEIGHT_FREE, Perceptual, perceptual, where_known
+from ihbench.fit.losses import Perceptual, where_known
 from ihbench.fit.optimisation import ParameterGroup
 from ihbench.fit.rays.marching import march_pixels, wanted_colors
 from ihbench.fit.rays.optimisation import DEPTHS, PIXELS, FieldOptimisation
+from ihbench.fit.rays.patch_loss import patch_distance, patch_loss
 from ihbench.fit.rays.sampling import draw_patches
 from ihbench.methods.humannerf.avatar import HumanNerfAvatar
-from ihbench.methods.humannerf.config import HumanNerfConfig
 from ihbench.methods.humannerf.spec import STATE
 from ihbench.scene.contracts import TrainingSet
 from ihbench.scene.spread import spread
@@ -66,20 +66,11 @@ class HumanNerfFit(FieldOptimisation[HumanNerfAvatar]):
         how often the fit started again."""
         config = self.avatar.config
         if config.lpips > 0:
-            self._perceptual = self._distance(config)
+            self._perceptual = patch_distance(config.lpips_net, config.without_lpips, self.avatar.device, self.ledger)
         super().run(progress)
         restarts = int(self.avatar.restarts)
         if restarts:
             self.ledger.event_once(Warned(f"started again {restarts} times: a picture showed nothing"))
-
-    def _distance(self, config: HumanNerfConfig) -> Perceptual | None:
-        distance = perceptual(config.lpips_net, self.avatar.device)
-        if not isinstance(distance, str):
-            return distance
-        instead = WEIGHT_FREE.get(config.without_lpips)
-        words = "nothing stands for it" if instead is None else f"{config.without_lpips} stands for it"
-        self.ledger.event_once(LeftOut("lpips term", f"{distance}; {words}"))
-        return instead
 
     # --- the loss ---
 
@@ -95,11 +86,7 @@ class HumanNerfFit(FieldOptimisation[HumanNerfAvatar]):
         rgb = shown.rgb
         if config.unknown == "ignore":
             rgb, image = where_known(rgb, image, unknown[..., None])
-        loss = config.mse * (rgb - image).square().mean()
-        if self._perceptual is not None:
-            distances = [self._perceptual(*each) for each in zip(rgb, image, strict=True)]
-            loss = loss + config.lpips * torch.stack(distances).mean()
-        return loss
+        return patch_loss(rgb, image, config.mse, self._perceptual, config.lpips)
 
     # --- the step ---
 

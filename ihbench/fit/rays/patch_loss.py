@@ -1,0 +1,36 @@
+"""What HumanNeRF and OccNeRF compare patches by: squared error and a perceptual distance."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ihbench.clock.events import LeftOut
+from ihbench.clock.ledger import Ledger
+from ihbench.fit.losses import WEIGHT_FREE, Perceptual, perceptual
+
+
+def patch_distance(net: str, instead: str, device: torch.device, ledger: Ledger) -> Perceptual | None:
+    """LPIPS with one of its networks; where its weights are missing a distance of `WEIGHT_FREE`, or None for a name
+    that is none of them, and the ledger has an event that says so."""
+    distance = perceptual(net, device)
+    if not isinstance(distance, str):
+        return distance
+    other = WEIGHT_FREE.get(instead)
+    words = "nothing stands for it" if other is None else f"{instead} stands for it"
+    ledger.event_once(LeftOut("lpips term", f"{distance}; {words}"))
+    return other
+
+
+def patch_loss(
+    rgb: Tensor,  # [P, h, w, 3]
+    image: Tensor,  # [P, h, w, 3]
+    mse: float,  # weight of the mean squared error over all pixels and channels
+    distance: Perceptual | None,
+    weight: float,  # of the mean of the patches' perceptual distances
+) -> Tensor:
+    """Scalar; differentiable in the rendering."""
+    loss = mse * (rgb - image).square().mean()
+    if distance is None:
+        return loss
+    return loss + weight * torch.stack([distance(*each) for each in zip(rgb, image, strict=True)]).mean()
