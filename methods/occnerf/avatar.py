@@ -29,7 +29,6 @@ from ihbench.render.volumes.fast import Skipping, draw_image
 
 KIND = "occnerf"
 DISPLACED = 1e-4  # m: bound of the first displacements
-CHANNELS = (1024, 512, 512, 256, 256)  # of the released decoder of motion weights
 
 
 class OccNerfAvatar(nn.Module):
@@ -45,13 +44,14 @@ class OccNerfAvatar(nn.Module):
         self.surface = CanonicalSurface(body, self.betas, seed, config.neighbour_cell)
         generator = torch.Generator().manual_seed(seed)
         joints = torch.from_numpy(np.array(body.shaped(self.betas)[1]))
-        self.joints = joints
+        self.joints = joints  # m, canonical
+        wide = config.weight_channels
         self.motion = MotionWeightVolume(
             joints,
             [int(p) for p in body.parents],
             generator,
-            code=config.decoder_code,
-            channels=[channels // config.decoder_share for channels in CHANNELS],
+            config.weight_code,
+            (wide, wide // 2, wide // 2, wide // 4, wide // 4),
         )
         self.grid = HashGrid4d(
             generator,
@@ -88,9 +88,9 @@ class OccNerfAvatar(nn.Module):
         """What does not depend on the pose: motion weights [25, 32, 32, 32] and vertex features [V, 35]."""
         return self.motion(), vertex_features(self)
 
-    def field(self, body_pose: BodyPose, volume: Tensor, features: Tensor, least: float | None = None) -> PosedField:
-        least = self.config.least if least is None else least
-        return PosedField(self, self.bones(body_pose, volume), features, least)
+    def posed(self, body_pose: BodyPose, volume: Tensor, features: Tensor) -> PosedField:
+        """The field of a pose, from what `decode` gave."""
+        return PosedField(self, self.bones(body_pose, volume), features)
 
     # --- drawing ---
 
@@ -106,13 +106,13 @@ class OccNerfAvatar(nn.Module):
         volume, features = self._cache.get(self, self.counters.cpu().numpy().tobytes(), self.decode)
         box = PosedBox.around(self.body, body_pose)
         drawn = draw_image(
-            self.field(body_pose, volume, features),
+            self.posed(body_pose, volume, features),
             camera,
             box.ends(features.dtype, features.device),
             self.config.samples,
             background,
             box.frame,
-            Skipping(least=self.config.least),
+            Skipping(self.config.least, self.config.stop),
         )
         return drawn.rgb.clamp(0, 1).cpu().numpy(), drawn.alpha.clamp(0, 1).cpu().numpy()
 

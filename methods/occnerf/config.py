@@ -33,15 +33,20 @@ class OccNerfConfig:
     """Their side."""
     samples: Annotated[int, Within(2, 4096)] = 128
     """Samples of a ray between the faces of the person's box."""
-    refined: Annotated[int, Within(0, 4096)] = 0
-    """Samples of a ray where the first ones met motion weights, instead of them; 0: those of the box are kept."""
+    inside: Annotated[int, Within(0, 4096)] = 0
+    """While fitting, samples of a second pass between the first and the last of them that is not empty; 0: none."""
     least: Annotated[float, Within(0, 1)] = 1e-3
-    """Motion weight below which a place counts as empty and no network is asked. Released: none is left out."""
+    """Samples less likely than this to be of the person are empty and no network sees them. A pixel is off by at most
+    their sum; 0 as released."""
+    least_weight: Annotated[float, Within(0, 1)] = 1e-4
+    """A bone is asked only inside the box beyond which its weights are all under this; 0 as released."""
+    stop: Annotated[float, Within(0, 1)] = 1e-3
+    """When drawing, rays that let through less than this are done; 0 as released."""
     neighbour_cell: Annotated[float, Within(0, 1)] = 0.0
     """Side in m of cells whose places share the neighbours of the cell's centre; 0: each has its own, as released."""
     clamp: bool = True
-    """Hold the sum of a place's motion weights, by which opacities are multiplied, to at most 1. Released: it may be
-    larger where limbs are close, and transmittance negative."""
+    """Hold likelihoods at 1 or under: where two limbs are close they sum to more, and a ray would let through a
+    negative share. Not so in the released code."""
     completeness: Literal["released", "body", "off"] = "released"
     """Whose density the completeness prior asks for: that of every sample inside the body, or, as released, also of
     every sample without motion weights, which the warp drops onto the origin, inside the torso."""
@@ -62,18 +67,19 @@ class OccNerfConfig:
     """Width of the hidden layers of both networks."""
     depth: Annotated[int, Within(1, 100)] = 4
     """How many hidden layers each has."""
-    decoder_code: Annotated[int, COUNT] = 256
-    """Length of the learned vector from which motion weights are decoded."""
-    decoder_share: Annotated[int, Within(1, 256)] = 1
-    """How many times fewer channels than released that decoder has."""
-    perceptual: Annotated[float, WEIGHT] = 1.0
-    """Weight of LPIPS on patches, or of what stands in for it where its trunk's weights are missing."""
-    perceptual_net: Literal["vgg", "alex", "squeeze"] = "vgg"
+    weight_code: Annotated[int, COUNT] = 256
+    """Numbers of the learned vector that the motion weights are decoded from."""
+    weight_channels: Annotated[int, Within(8, 4096)] = 1024
+    """Channels of their decoder's first layer; a half, a half, a quarter and a quarter in the next ones."""
+    lpips: Annotated[float, WEIGHT] = 1.0
+    """Weight of the perceptual distance of patches: LPIPS where its trunk's weights are, else `without_lpips`."""
+    lpips_net: Literal["vgg", "alex", "squeeze"] = "vgg"
     """Trunk of LPIPS."""
     mse: Annotated[float, WEIGHT] = 0.2
     """Weight of the mean squared error on patches."""
-    stand_in: Literal["pyramid", "ssim", "l1"] = "ssim"
-    """What stands in for LPIPS where its trunk's weights are missing."""
+    without_lpips: Literal["ssim", "l1", "pyramid", "none"] = "ssim"
+    """What takes its place where the weights are missing, and the record says so: 1 - SSIM, mean absolute difference,
+    that over bands of a pyramid, or nothing."""
     lr: Annotated[float, RATE] = 5e-4
     """Adam's step size of both networks."""
     lr_grid: Annotated[float, RATE] = 5e-4
@@ -97,7 +103,7 @@ PAPER = OccNerfConfig()
 ON_A_CPU = replace(
     PAPER,
     patches=2,
-    refined=24,
+    inside=24,
     least=5e-3,
     neighbour_cell=0.01,
     completeness="body",
@@ -106,8 +112,8 @@ ON_A_CPU = replace(
     hash_finest=512,
     width=64,
     depth=3,
-    decoder_code=64,
-    decoder_share=8,
+    weight_code=64,
+    weight_channels=128,
     second_moment=0.99,
 )
 QUICK = replace(ON_A_CPU, steps=400, decay_steps=400, lr=2e-3, lr_grid=1e-2, lr_motion=5e-4)
@@ -116,14 +122,14 @@ SMOKE = replace(
     steps=60,
     patch_px=16,
     samples=64,
-    refined=16,
+    inside=16,
     levels=5,
     hash_size=12,
     hash_finest=128,
     width=32,
     depth=2,
-    decoder_code=32,
-    decoder_share=16,
+    weight_code=32,
+    weight_channels=64,
     neighbour_cell=0.02,
     decay_steps=60,
     lr=5e-3,
@@ -145,5 +151,5 @@ def leave_out(config: OccNerfConfig, scene: SceneMeasure) -> list[Omission]:
 def outside_files(config: OccNerfConfig) -> list[Path]:
     """Files whose content affects the answer: the trunk of LPIPS, in whose place another distance stands while the
     file is not there."""
-    trunk = locate(FILES[f"lpips-{config.perceptual_net}"]) if config.perceptual > 0 else None
+    trunk = locate(FILES[f"lpips-{config.lpips_net}"]) if config.lpips > 0 else None
     return [trunk] if isinstance(trunk, Path) else []

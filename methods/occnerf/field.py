@@ -88,20 +88,24 @@ def decoded(
 
 
 class PosedField:
-    """See `ihbench.render.volumes.field.Field`."""
+    """The field as it is seen in one pose, in the root's frame; a `render.volumes.field.Field`."""
 
-    def __init__(self, avatar: OccNerfAvatar, bones: BoneWeights, features: Tensor, least: float):
-        self.avatar, self.bones, self.features, self.least = avatar, bones, features, least
+    def __init__(self, avatar: OccNerfAvatar, bones: BoneWeights, features: Tensor):
+        self.avatar, self.bones, self.features = avatar, bones, features
 
     def likelihood(self, rays: Rays, depths: Tensor) -> Tensor:
-        """[N, S] Σ w of the bones."""
-        return self.bones.likelihood(rays, depths, self.least)
+        return self.bones.likelihood(rays, depths, self.avatar.config.least_weight)
 
     def values(self, points: Tensor) -> SurfaceValues:
-        likelihood, canonical = self.bones.located(points, self.least)
-        if self.avatar.config.clamp:
-            likelihood = likelihood.clamp(max=1)
+        config = self.avatar.config
+        likelihood, canonical = self.bones.located(points, config.least_weight)
         canonical = canonical.detach()
         found = decoded(self.avatar, self.features, canonical)
-        density = softplus_density(found.raw)
-        return SurfaceValues(found.rgb, density, likelihood, raw=found.raw, inside=found.inside, canonical=canonical)
+        return SurfaceValues(
+            found.rgb,
+            softplus_density(found.raw),
+            likelihood.clamp(max=1) if config.clamp else likelihood,
+            raw=found.raw,
+            inside=found.inside,
+            canonical=canonical,
+        )

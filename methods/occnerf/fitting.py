@@ -14,13 +14,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ihbench.clock.events import LeftOut
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.fit.losses import WEIGHT_FREE, Perceptual, perceptual, where_known
+from ihbench.fit.losses import Perceptual, where_known
 from ihbench.fit.optimisation import ParameterGroup
 from ihbench.fit.rays.marching import MarchedPixels, march_pixels, wanted_colors
 from ihbench.fit.rays.optimisation import DEPTHS, PIXELS, FieldOptimisation
+from ihbench.fit.rays.patch_loss import patch_distance, patch_loss
 from ihbench.fit.rays.ray_target import RayTarget
 from ihbench.fit.rays.sampling import Pixels, draw_patches
 from ihbench.methods.occnerf.avatar import OccNerfAvatar
@@ -76,19 +76,15 @@ class OccNerfFit(FieldOptimisation[OccNerfAvatar]):
         )
         for group in self.optimizer.param_groups:
             group["betas"] = (0.9, config.second_moment)
-        self._distance: Perceptual = WEIGHT_FREE[config.stand_in]
+        self._perceptual: Perceptual | None = None
         self._looked_at: MarchedPixels | None = None
         self._prior: Completeness | None = None
 
     def run(self, progress: Progress) -> None:
         """As `Optimisation.run`; an event says so when LPIPS is wanted and its weights are missing."""
         config = self.avatar.config
-        if config.perceptual > 0:
-            distance = perceptual(config.perceptual_net, self.avatar.device)
-            if isinstance(distance, str):
-                self.ledger.event_once(LeftOut("lpips term", f"{distance}; {config.stand_in} stands in"))
-            else:
-                self._distance = distance
+        if config.lpips > 0:
+            self._perceptual = patch_distance(config.lpips_net, config.without_lpips, self.avatar.device, self.ledger)
         super().run(progress)
 
     @cached_property
@@ -107,14 +103,14 @@ class OccNerfFit(FieldOptimisation[OccNerfAvatar]):
         volume, features = avatar.decode()
         background = self.random_background()
         shown = march_pixels(
-            avatar.field(target.body_pose, volume, features),
+            avatar.posed(target.body_pose, volume, features),
             target,
             pixels,
             config.samples,
             background,
             self.rng(DEPTHS),
             config.least,
-            config.refined,
+            config.inside,
         )
         loss = self._image_loss(shown.rgb, target, pixels, background)
         prior = self._completeness(shown, target, pixels, features)
@@ -123,17 +119,11 @@ class OccNerfFit(FieldOptimisation[OccNerfAvatar]):
         return loss if prior is None else loss + config.completeness_weight * prior.total
 
     def _image_loss(self, rgb: Tensor, target: RayTarget, pixels: Pixels, background: Tensor) -> Tensor:
-        """The mean squared error over all pixels and channels of the patches, and the mean of their perceptual
-        distances."""
         config = self.avatar.config
         wanted, unknown = wanted_colors(target, pixels, background)
         if unknown.any():
             rgb, wanted = where_known(rgb, wanted, unknown[..., None].to(rgb))
-        loss = config.mse * (rgb - wanted).square().mean()
-        if config.perceptual > 0:
-            distances = [self._distance(own, image) for own, image in zip(rgb, wanted, strict=True)]
-            loss = loss + config.perceptual * torch.stack(distances).mean()
-        return loss
+        return patch_loss(rgb, wanted, config.mse, self._perceptual, config.lpips)
 
     def _completeness(
         self, shown: MarchedPixels, target: RayTarget, pixels: Pixels, features: Tensor
@@ -148,7 +138,7 @@ class OccNerfFit(FieldOptimisation[OccNerfAvatar]):
             at = decoded(self.avatar, features, features.new_zeros(1, 3))
             origin = at.raw[0], at.inside[0]
         shares = None
-        if config.refined:
+        if config.inside:
             near, far = box_interval(shown.rays, *target.box.ends(features.dtype, features.device))
             apart = (far - near) / (config.samples - 1)
             own = (shown.depths[:, -1] - shown.depths[:, 0]) / (shown.depths.shape[1] - 1)

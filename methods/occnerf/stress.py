@@ -19,7 +19,7 @@ from ihbench.stress.fit_cases import STEP, FitCases
 from ihbench.stress.resuming import changed_by_a_kill
 from ihbench.stress.six_views import only_a_pixel, training_set, views, with_bad_hidden_pixels
 
-TINY = replace(SMOKE, steps=18, decay_steps=18, samples=32, refined=0, levels=3, hash_size=8, hash_finest=32)
+TINY = replace(SMOKE, steps=18, decay_steps=18, samples=32, inside=0, levels=3, hash_size=8, hash_finest=32)
 RATES = ("lr", "lr_grid", "lr_displacement", "lr_motion")
 
 
@@ -68,7 +68,7 @@ def _resumed() -> Answer:
     from ihbench.methods.occnerf.fitting import OccNerfFit
 
     training = training_set()
-    config = replace(TINY, refined=8)
+    config = replace(TINY, inside=8)
     whole, _ = OURS.story(config, training)
     assert whole is not None
     changed = changed_by_a_kill(

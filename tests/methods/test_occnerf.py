@@ -39,7 +39,7 @@ from .tiny_fit import SIZE, equal_bits, training_set, training_views
 from .tiny_gaussians import SavesAt, events, killed_after
 
 BODY = the_body()
-SMALL = replace(TINY, steps=10, decay_steps=10, patch_px=12, samples=24, width=16, decoder_code=8, decoder_share=64)
+SMALL = replace(TINY, steps=10, decay_steps=10, patch_px=12, samples=24, width=16, weight_code=8, weight_channels=16)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -69,7 +69,7 @@ def everything(avatar):
 def whole():
     """A fit to all views, in two passes, and its ledger."""
     ledger = Ledger()
-    fit = a_fit(training_set(training_views()), ledger=ledger, refined=8)
+    fit = a_fit(training_set(training_views()), ledger=ledger, inside=8)
     fit.run(Progress.silent())
     return fit.avatar, ledger
 
@@ -84,7 +84,7 @@ def seen_from_the_front(avatar, pixels, samples, dtype=torch.float32):
     depths = even_depths(near[met], far[met], samples)
     rays = rays[met]
     volume, features = avatar.decode()
-    return avatar.field(pose, volume, features, 0.0), rays, depths, segment_lengths(depths, rays.lengths)
+    return avatar.posed(pose, volume, features), rays, depths, segment_lengths(depths, rays.lengths)
 
 
 # ------------------------------------------------------------------------------------------ check 3: who ends a ray
@@ -204,7 +204,7 @@ def test_check_7_pose_moves_and_corrects_nothing(views):
     at = decoded(avatar, features, places)
     (gradient,) = torch.autograd.grad(at.raw.sum() + at.rgb.sum(), places, allow_unused=True)
     assert gradient is None
-    field = avatar.field(a_pose(0.3, 0.5), *avatar.decode())
+    field = avatar.posed(a_pose(0.3, 0.5), *avatar.decode())
     posed = field.values(torch.zeros(1, 3))
     again = decoded(avatar, features, posed.canonical)
     torch.testing.assert_close(again.raw, posed.raw)
@@ -247,7 +247,7 @@ def test_check_8_the_prior_keeps_a_hidden_slab_solid():
 
 
 def test_the_fast_renderer_is_the_twin_without_any_skipping():
-    avatar = an_avatar(clamp=False, neighbour_cell=0.0)
+    avatar = an_avatar(clamp=False, neighbour_cell=0.0, least_weight=0.0)
     with torch.no_grad():
         avatar.grid.table.mul_(2e3)
         avatar.counters += torch.randint(0, 50, avatar.counters.shape, generator=torch.Generator().manual_seed(0))
@@ -285,7 +285,7 @@ def test_samples_without_weights_count_as_the_origin_as_released(views):
     training = training_set(views)
     values = {}
     for kind, refined in (("body", 0), ("body", 12), ("released", 0), ("off", 0)):
-        fit = a_fit(training, completeness=kind, refined=refined)
+        fit = a_fit(training, completeness=kind, inside=refined)
         fit._loss(0)
         values[kind, refined] = fit._prior
     assert values["off", 0] is None
@@ -301,11 +301,11 @@ def test_samples_without_weights_count_as_the_origin_as_released(views):
 
 def test_everything_learns_and_the_record_says_how(views):
     avatar, ledger = whole()
-    first = start(replace(SMALL, refined=8), training_set(views))
+    first = start(replace(SMALL, inside=8), training_set(views))
     for name, value in avatar.named_parameters():
         if name.startswith("motion.") or name.startswith("decoder.") or name in ("displacement", "grid.table"):
             assert not torch.equal(value, dict(first.named_parameters())[name]), name
-    assert any(event.kind == LeftOut.kind and "stands in" in event.data["reason"] for event in ledger.events) or (
+    assert any(event.kind == LeftOut.kind and "stands for it" in event.data["reason"] for event in ledger.events) or (
         not any(event.kind == LeftOut.kind for event in ledger.events)
     )
     assert avatar.counters.max() > 1
@@ -335,12 +335,12 @@ def test_released_rates_fall_and_everything_is_clipped_together(views):
     norm = torch.stack([p.grad.norm() for p in fit.avatar.parameters() if p.grad is not None]).norm()
     assert float(norm) == pytest.approx(1.0, abs=1e-4)
     assert (PAPER.lr, PAPER.lr_grid, PAPER.lr_displacement, PAPER.lr_motion) == (5e-4, 5e-4, 1e-4, 5e-5)
-    assert (PAPER.mse, PAPER.perceptual, PAPER.completeness_weight, PAPER.clip) == (0.2, 1.0, 1.0, 1.0)
+    assert (PAPER.mse, PAPER.lpips, PAPER.completeness_weight, PAPER.clip) == (0.2, 1.0, 1.0, 1.0)
 
 
 def test_the_released_sizes():
     sizes = (PAPER.levels, PAPER.hash_size, PAPER.hash_finest, PAPER.width, PAPER.depth, PAPER.samples, PAPER.patches,
-             PAPER.patch_px, PAPER.refined, PAPER.steps)  # fmt: skip
+             PAPER.patch_px, PAPER.inside, PAPER.steps)  # fmt: skip
     assert sizes == (16, 19, 2048, 256, 4, 128, 6, 32, 0, 100_000)
 
 
@@ -349,8 +349,8 @@ def test_a_resumed_fit_is_the_same_to_the_bit(views):
     training = training_set(views)
     avatar, _ = whole()
     ledger = SavesAt(5)
-    killed_after(a_fit(training, ledger=ledger, refined=8), 7)
-    again = a_fit(training, ledger=ledger, refined=8)
+    killed_after(a_fit(training, ledger=ledger, inside=8), 7)
+    again = a_fit(training, ledger=ledger, inside=8)
     again.run(Progress.silent())
     assert equal_bits(everything(again.avatar), everything(avatar))
 
@@ -474,7 +474,7 @@ def test_stress_cases_pass(name):
 
 def test_a_ray_that_meets_nothing_is_the_background():
     avatar = an_avatar()
-    field = avatar.field(a_pose(), *avatar.decode())
+    field = avatar.posed(a_pose(), *avatar.decode())
     rays = Rays(torch.tensor([[0.0, 0.0, -3.0]]), torch.tensor([[1.0, 0.0, 0.0]]))
     depths = torch.linspace(1, 2, 8)[None]
     shown = march(field, rays, depths, segment_lengths(depths, rays.lengths))
