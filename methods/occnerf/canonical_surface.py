@@ -52,7 +52,7 @@ class CanonicalSurface(nn.Module):
             self.register_buffer(name, torch.from_numpy(np.array(value, np.float32)), persistent=False)
         start = int(np.random.default_rng((seed, 0)).integers(len(vertices)))
         counts = [max(math.ceil(len(vertices) / times), NEIGHBOURS) for times in COARSER]
-        order = farthest_points(vertices, max(counts), start)
+        order = _order(np.asarray(vertices, np.float64).tobytes(), max(counts), start)
         for level, count in enumerate(counts, 1):  # each subset is the beginning of the next finer one
             self.register_buffer(f"subset_{level}", torch.from_numpy(order[:count].copy()))
 
@@ -99,6 +99,11 @@ def _search(
     where = np.frombuffer(points, np.float32).reshape(-1, 3)
     sets = [np.arange(len(where)), *(np.frombuffer(each, np.int64) for each in subsets)]
     return NearestVertices(where, sets, count, (np.array(low, np.float32), np.array(high, np.float32)), cell)
+
+
+@lru_cache(maxsize=8)
+def _order(points: bytes, count: int, start: int) -> NDArray[np.int64]:  # float64 [V, 3]
+    return farthest_points(np.frombuffer(points).reshape(-1, 3), count, start)
 
 
 def vertex_normals(

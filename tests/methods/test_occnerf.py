@@ -442,13 +442,13 @@ def test_shapes_that_differ_by_frame_become_their_mean_and_are_said(views):
 class Scene:
     """A `SceneMeasure` of which the plan reads these."""
 
-    hidden_share, covered_views = 0.3, 80
+    covered_views = 80
 
 
 def test_the_plan_leaves_out_what_a_scene_does_not_need():
     scene = Scene()
     assert leave_out(QUICK, scene) == []
-    scene.hidden_share, scene.covered_views = 0.0, 0
+    scene.covered_views = 0
     assert [(o.field, o.value) for o in leave_out(QUICK, scene)] == [("visibility", False)]
     assert leave_out(replace(QUICK, visibility=False), scene) == []
 
