@@ -33,6 +33,8 @@ class TrainView:
     body_pose: BodyPose
     frame: int  # frame number in the capture
     camera_id: str
+    filmed: NDArray[np.uint8] | None = None  # [H, W, 3] RGB as photographed, occluder and room included; only where
+    # the occluder stands in the scene: elsewhere it would show what a drawn occluder hides
 
 
 @dataclass(frozen=True)

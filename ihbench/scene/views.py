@@ -216,6 +216,16 @@ class Undistorter:
         full[rows, columns] = part
         return self._to_8bit(self.shrink(full, self._rule.resample_image))
 
+    def whole(
+        self,
+        image: NDArray[np.uint8],  # [H, W, 3] the original
+    ) -> NDArray[np.uint8]:
+        """[h, w, 3] the photograph itself, undistorted, resampled, 8 bit; background where none shows anything."""
+        out = self._to_8bit(self.shrink(self.straighten(image).astype(np.float32), self._rule.resample_image))
+        if self.unphotographed is not None:
+            out[self.unphotographed] = self.background
+        return out
+
     def _to_8bit(self, image: NDArray[np.float32]) -> NDArray[np.uint8]:
         return (np.clip(image, 0, 255) + (0.5 if self._rule.to_8bit == "round" else 1e-3)).astype(np.uint8)
 
@@ -282,6 +292,7 @@ def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
         lens, frame = lenses[protocol.train.camera], frames[k]
         person = silhouette(protocol.train.camera, frame)
         image = capture.image(protocol.train.camera, frame)
+        filmed = lens.whole(image) if hiding.in_scene else None
         unknown = [lens.cut_off(capture.model, capture.body_pose(frame))] if lens.unphotographed is not None else []
         if covered[k]:
             hidden, touched = hidden_of(frame)
@@ -296,7 +307,13 @@ def open_scene(capture: Capture, protocol: Protocol) -> OccludedScene:
                 state[pixels] = MaskState.UNKNOWN
                 image[pixels] = lens.background
         return TrainView(
-            image, state, lens.camera, capture.body_pose(frame), frame, capture.camera_ids[protocol.train.camera]
+            image,
+            state,
+            lens.camera,
+            capture.body_pose(frame),
+            frame,
+            capture.camera_ids[protocol.train.camera],
+            filmed,
         )
 
     keys = test_view_keys(protocol, capture.name, capture.n_frames, capture.camera_ids)

@@ -124,6 +124,27 @@ def test_ordinary_views_are_as_they_were():
     assert all(view.hidden is None for view in scene.test)
 
 
+def test_what_was_filmed_is_shown_where_the_occluder_stands_in_the_scene():
+    """The photograph with the table and the room; a method that models the occluder may see it."""
+    _, capture = behind_a_table()
+    for view in open_scene(capture, natural(size=96)).train:
+        assert view.filmed is not None
+        assert np.array_equal(view.filmed, capture.image(0, view.frame))
+        person = view.mask == MaskState.PERSON
+        assert np.array_equal(view.filmed[person], view.image[person])
+    small = open_scene(capture, natural(size=48)).train[0].filmed
+    assert small is not None
+    blocks = capture.image(0, 0).reshape(48, 2, 48, 2, 3).mean((1, 3))
+    assert np.abs(small - blocks).max() <= 1
+
+
+def test_nothing_is_filmed_behind_a_drawn_occluder():
+    """Its photograph is the un-occluded truth."""
+    whole, _ = behind_a_table()
+    for rule in ("none", "strip-generic", "lower-half"):
+        assert all(view.filmed is None for view in open_scene(whole, fake_protocol("zju_occ", 6, 96, rule)).train)
+
+
 # ------------------------------------------------------------------------------------------------- scoring
 
 
