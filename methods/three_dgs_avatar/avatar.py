@@ -20,9 +20,9 @@ from ihbench.fit.decoded_cache import DecodedCache
 from ihbench.fit.gaussians.gaussian_set import SHAPES, Carried, Gaussians
 from ihbench.fit.gaussians.posed import PosedGaussians
 from ihbench.fit.gaussians.skinned_covariance import blended_linear, skinned_covariance
+from ihbench.fit.training_poses import PoseTables, TrainingPoses, latent_codes
 from ihbench.methods.three_dgs_avatar.colours import FEATURE, LATENT, ColourNetwork, canonical_directions
 from ihbench.methods.three_dgs_avatar.config import ThreeDgsAvatarConfig
-from ihbench.methods.three_dgs_avatar.frame_tables import PoseTables, TrainingPoses, latent_codes
 from ihbench.methods.three_dgs_avatar.isometry import NEIGHBOURS
 from ihbench.methods.three_dgs_avatar.non_rigid import NonRigid, turned
 from ihbench.methods.three_dgs_avatar.skinning_field import SkinningField

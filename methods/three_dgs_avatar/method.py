@@ -11,10 +11,10 @@ from ihbench.clock.events import Warned
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
+from ihbench.fit.training_poses import TrainingPoses
 from ihbench.methods.three_dgs_avatar.avatar import ThreeDgsAvatar
 from ihbench.methods.three_dgs_avatar.config import ThreeDgsAvatarConfig
 from ihbench.methods.three_dgs_avatar.fitting import ThreeDgsAvatarFit
-from ihbench.methods.three_dgs_avatar.frame_tables import TrainingPoses
 from ihbench.scene.contracts import TrainingSet
 
 SAME_BETAS = 1e-3  # a shape coefficient that varies less over the frames is the same

@@ -45,8 +45,8 @@ def fit(config: ThreeDgsAvatarConfig, training: TrainingSet, ledger: Ledger) -> 
 
 def start(config: ThreeDgsAvatarConfig, training: TrainingSet) -> Any:
     """The avatar that a fit begins with."""
+    from ihbench.fit.training_poses import TrainingPoses
     from ihbench.methods.three_dgs_avatar.avatar import ThreeDgsAvatar
-    from ihbench.methods.three_dgs_avatar.frame_tables import TrainingPoses
 
     betas = training.views[0].body_pose.betas
     return ThreeDgsAvatar(config, training.body, betas, TrainingPoses.of(training.views), 0)

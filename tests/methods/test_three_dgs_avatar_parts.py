@@ -16,9 +16,9 @@ from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput
 from ihbench.fit.gaussians.neighbours import distance_to, nearest, spacing
 from ihbench.fit.gaussians.skinned_covariance import quaternion_to_matrix
+from ihbench.fit.training_poses import TrainingPoses
 from ihbench.methods.three_dgs_avatar.avatar import ThreeDgsAvatar
 from ihbench.methods.three_dgs_avatar.colours import ColourNetwork, canonical_directions, random_turn
-from ihbench.methods.three_dgs_avatar.frame_tables import TrainingPoses
 from ihbench.methods.three_dgs_avatar.isometry import six_entries, stretching
 from ihbench.methods.three_dgs_avatar.non_rigid import NonRigid, turned
 from ihbench.methods.three_dgs_avatar.pose_code import PoseCode

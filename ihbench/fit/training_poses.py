@@ -1,6 +1,6 @@
 """What is learned for single training frames: a pose, a translation and a latent code each, and one shape for all.
 
-3DGS-Avatar, models/pose_correction/pose_correction.py:164-219 and models/texture/texture.py.
+As in 3DGS-Avatar, models/pose_correction/pose_correction.py:164-219 and models/texture/texture.py, and Vid2Avatar.
 """
 
 from __future__ import annotations
