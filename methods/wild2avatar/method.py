@@ -1,0 +1,49 @@
+"""Wild2Avatar as a registered method (Xiang, Sun, Delp, Kozuka, Fei-Fei, Adeli, TPAMI 2025)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ihbench.body import Body
+from ihbench.clock.events import Warned
+from ihbench.clock.ledger import Ledger
+from ihbench.clock.progress import Progress
+from ihbench.errors import BadInput
+from ihbench.fit.training_poses import TrainingPoses
+from ihbench.methods.wild2avatar.avatar import Wild2AvatarAvatar
+from ihbench.methods.wild2avatar.config import Wild2AvatarConfig
+from ihbench.methods.wild2avatar.fitting import Wild2AvatarFit
+from ihbench.scene.contracts import TrainingSet
+
+SAME_BETAS = 1e-3  # a shape coefficient that varies less over the frames is the same
+
+
+class Wild2Avatar:
+    """Three fields fitted to the training views in one go, after the person's has been made the body."""
+
+    def __init__(self, config: Wild2AvatarConfig):
+        self.config = config
+
+    def fit(
+        self, training: TrainingSet, *, device: str, seed: int, ledger: Ledger, progress: Progress
+    ) -> Wild2AvatarAvatar:
+        """Fit one person. See `scene.contracts.Method`. Raises `BadInput` without a view that shows the person, and
+        `Diverged`."""
+        if not len(training.views):
+            raise BadInput(f"scene {training.name}: no training view; nothing to fit")
+        with ledger.stage("fit/prepare"):
+            betas = np.array([view.body_pose.betas for view in training.views])
+            if np.ptp(betas, axis=0).max(initial=0) > SAME_BETAS:
+                ledger.event_once(Warned("shape coefficients vary over the frames; the avatar has their mean"))
+            poses = TrainingPoses.of(training.views)
+            avatar = Wild2AvatarAvatar(self.config, training.body, betas.mean(0), poses, seed).to(device)
+            fit = Wild2AvatarFit(avatar, training, seed, ledger)
+        with ledger.stage("fit/fields"):
+            fit.run(progress)
+        return avatar
+
+    def load(self, folder: Path, body: Body, device: str = "cpu") -> Wild2AvatarAvatar:
+        """Read an avatar written by `Wild2AvatarAvatar.save`."""
+        return Wild2AvatarAvatar.load(folder, body, device)

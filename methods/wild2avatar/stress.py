@@ -1,0 +1,108 @@
+"""Stiff training of Wild2Avatar: what is asked of every such fit (`stress.fit_cases`), rays that see nothing, shapes
+that differ by frame, a person whose surface has vanished, and a kill. Named in the spec."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ihbench.clock.ledger import Ledger
+from ihbench.clock.progress import Progress
+from ihbench.methods.wild2avatar.config import SMOKE, Wild2AvatarConfig
+from ihbench.methods.wild2avatar.method import Wild2Avatar
+from ihbench.scene.contracts import TrainingSet
+from ihbench.stress.case import Answer
+from ihbench.stress.fit_cases import FitCases
+from ihbench.stress.resuming import changed_by_a_kill
+from ihbench.stress.six_views import training_set, views
+
+# every part in 18 steps, three looks at the surface among them
+TINY = replace(
+    SMOKE,
+    steps=18,
+    scene="constant",
+    rays=64,
+    sdf_width=32,
+    sdf_depth=2,
+    colour_width=16,
+    body_fit=80,
+    even_samples=12,
+    samples_by_weight=5,
+    samples_extra=2,
+    scene_width=16,
+    scene_depth=2,
+    scene_samples=4,
+    eikonal_points=32,
+    refresh_epochs=1,
+    lr_sdf=2e-3,
+)
+RATES = ("lr", "lr_sdf", "lr_beta")
+
+
+def fit(config: Wild2AvatarConfig, training: TrainingSet, ledger: Ledger) -> Any:
+    return Wild2Avatar(config).fit(training, device="cpu", seed=0, ledger=ledger, progress=Progress.silent())
+
+
+def start(config: Wild2AvatarConfig, training: TrainingSet) -> Any:
+    """The avatar that a fit begins with: the body, in no colour."""
+    from ihbench.fit.training_poses import TrainingPoses
+    from ihbench.methods.wild2avatar.avatar import Wild2AvatarAvatar
+
+    betas = training.views[0].body_pose.betas
+    return Wild2AvatarAvatar(config, training.body, betas, TrainingPoses.of(training.views), 0)
+
+
+def begun(config: Wild2AvatarConfig, training: TrainingSet) -> Any:
+    avatar = start(config, training)
+    avatar.fit_to_body()
+    return avatar
+
+
+def _other_shapes() -> Answer:
+    """Shape coefficients that differ by frame: one avatar, with their mean."""
+    shown = [
+        replace(view, body_pose=replace(view.body_pose, betas=np.array([0.5 * (-1) ** k, 0.0])))
+        for k, view in enumerate(views())
+    ]
+    return OURS.ratio(TINY, training_set(shown))
+
+
+def _vanished() -> Answer:
+    """A distance field that is positive everywhere: nothing is drawn, and no gradient is NaN."""
+    import torch
+
+    from ihbench.methods.wild2avatar.fitting import Wild2AvatarFit
+
+    avatar, training = begun(TINY, training_set()), training_set()
+    with torch.no_grad():
+        avatar.field.sdf.last.bias[0] += 10.0
+    Wild2AvatarFit(avatar, training, 0, Ledger())._one_step(0)
+    view = views()[0]
+    rgb, alpha = avatar.render(view.camera, view.body_pose)
+    finite = all(p.isfinite().all() for p in avatar.parameters()) and bool(np.isfinite(rgb).all())
+    return Answer(f"finite {finite}, alpha {alpha.max():.0f}", "finite True, alpha 0")
+
+
+def _resumed() -> Answer:
+    """Killed between two looks at the surface, and gone on with: the same bits as without."""
+    from ihbench.methods.wild2avatar.fitting import Wild2AvatarFit
+
+    training = training_set()
+    whole, _ = OURS.story(TINY, training)
+    assert whole is not None
+    changed = changed_by_a_kill(
+        lambda: start(TINY, training), lambda avatar, ledger: Wild2AvatarFit(avatar, training, 0, ledger), whole
+    )
+    return Answer(changed, 0)
+
+
+OURS = FitCases("wild2avatar", TINY, RATES, fit, begun)
+CASES = [
+    *OURS.usual(TINY, replace(TINY, steps=45), None),
+    OURS.helps("other-shapes", "shape coefficients that differ by frame", _other_shapes),
+    OURS.case("vanished", "a surface that is nowhere", _vanished, "words", "an empty picture is a picture"),
+    OURS.case("resumed", "killed and gone on with", _resumed, "absolute", "what continues is the same fit"),
+]
