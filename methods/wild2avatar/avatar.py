@@ -74,9 +74,7 @@ class Wild2AvatarAvatar(nn.Module):
     @property
     def counts(self) -> SampleCounts:
         config = self.config
-        return SampleCounts(
-            config.even_samples, config.sample_rounds, config.samples_by_weight, config.samples_extra
-        )
+        return SampleCounts(config.even_samples, config.sample_rounds, config.samples_by_weight, config.samples_extra)
 
     def fit_to_body(self) -> None:
         """The start: the body's own surface."""

@@ -59,7 +59,7 @@ class CanonicalBody(nn.Module):
         """[24, 4, 4] B: canonical pose to world. Differentiable in all three."""
         joints = self.rest_joints
         if betas is not None:
-            joints = joints + self.joint_shapes @ (betas - torch.from_numpy(self.betas).to(betas))
+            joints = joints + self.joint_shapes @ (betas - torch.from_numpy(np.array(self.betas)).to(betas))
         return joint_transforms(pose, joints, self.parents, transl) @ self.from_canonical
 
     def bones_of(self, body_pose: BodyPose) -> Tensor:

@@ -1,6 +1,6 @@
 """What rays show of occluder and background, and all three parts together.
 
-    C = C_o + (1 - A_o) [C_h + (1 - A_h) C_b]
+C = C_o + (1 - A_o) [C_h + (1 - A_h) C_b]
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """What stands before and behind the person: one network in inverted-sphere coordinates (Vid2Avatar's background).
 
-    γ₁₀(p/ρ, ±1/ρ) ⊕ code of the frame → layers with softplus (β = 100) → density |raw|, features
-    γ₄(direction) ⊕ code ⊕ features → one layer with ReLU → RGB
+γ₁₀(p/ρ, ±1/ρ) ⊕ code of the frame → layers with softplus (β = 100) → density |raw|, features
+γ₄(direction) ⊕ code ⊕ features → one layer with ReLU → RGB
 """
 
 from __future__ import annotations
@@ -32,7 +32,9 @@ class SceneNetwork(nn.Module):
         direction = 3 + 6 * VIEW_FREQUENCIES
         self.colour = nn.Linear(direction + CODE + width, width // 2)
         self.rgb = nn.Linear(width // 2, 3)
-        for layer in (*self.layers, self.last, self.colour, self.rgb):
+        for layer in self.modules():
+            if not isinstance(layer, nn.Linear):
+                continue
             bound = 1 / math.sqrt(layer.in_features)
             nn.init.uniform_(layer.weight, -math.sqrt(3) * bound, math.sqrt(3) * bound, generator)
             nn.init.uniform_(layer.bias, -bound, bound, generator)

@@ -3,7 +3,6 @@ that differ by frame, a person whose surface has vanished, and a kill. Named in 
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 

@@ -1,5 +1,5 @@
-"""A person who turns a little before a wall, behind a red box in most frames, with photographs of both. For tests of what models its
-occluder."""
+"""A person who turns a little before a wall, behind a red box in most frames, with photographs of both. For tests of
+what models its occluder."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from ihbench.scene.contracts import MaskState, TrainingSet, TrainView
 from ihbench.scene.occlusion import grown_for_clothes
 from tests.bench.fake_capture import WHITE, a_camera, a_pose, rasterized, the_body, train_view
 
-SIZE, FRAMES = 48, 5
-BOX = np.s_[20:30, 10:38]  # rows and columns: hips and hands
+SIZE, FRAMES = 72, 5
+BOX = np.s_[30:45, 15:57]  # rows and columns: hips and hands
 RED = np.array([230, 20, 20], np.uint8)
 CAMERA = a_camera(0.0, SIZE)
 

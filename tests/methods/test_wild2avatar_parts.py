@@ -415,7 +415,7 @@ def test_rays_beside_the_surface():
 # ------------------------------------------------------------------------------------------------- the loss's terms
 
 
-def a_target(strip=slice(20, 28)):
+def a_target(strip: slice | None = slice(20, 28)):
     view = train_view(a_camera(0.0, SIZE), a_pose(), strip, frame=7)
     return prepare_target(view, 0, BODY, False, torch.device("cpu"))
 
