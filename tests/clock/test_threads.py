@@ -13,14 +13,14 @@ import pytest
 
 from ihbench.clock.threads import WAITING, WORDS, begin_on_one_thread
 
-# says what OpenMP is going to read, at the moment at which torch is first looked for
+# says what OpenMP is going to read, at the moment at which torch is first looked for, and ends there
 WATCH = f"""
 import json, os, sys
 class Watch:
     def find_spec(self, name, *_):
         if name == "torch":
             print(json.dumps({{word: os.environ.get(word) for word in {WORDS!r}}}), flush=True)
-            sys.meta_path.remove(self)
+            os._exit(0)
 sys.meta_path.insert(0, Watch())
 """
 
