@@ -30,15 +30,7 @@ def fractal_noise(points: NDArray[np.floating], seed: int, frequency: float, oct
 def _kernel():
     from numba import njit, uint32
 
-    @njit(cache=True, nogil=True)
-    def corner(i, j, k, seed):
-        # numba widens uint32 products to 64 bits; the casts bring the hash back to 32
-        h = uint32(uint32(i) * 73856093 ^ uint32(j) * 19349663 ^ uint32(k) * 83492791 ^ seed)
-        h = uint32((h ^ (h >> 16)) * 0x7FEB352D)
-        h = uint32((h ^ (h >> 15)) * 0x846CA68B)
-        return uint32(h ^ (h >> 16)) / 4294967295.0
-
-    @njit(cache=True, nogil=True)
+    @njit(cache=True, nogil=True)  # one function: the code of one that calls another from here is never found again
     def noise(points, seed, frequency):
         out = np.empty(len(points), np.float32)
         for n in range(len(points)):
@@ -51,7 +43,12 @@ def _kernel():
                 for b in range(2):
                     for c in range(2):
                         weight = (x if a else 1 - x) * (y if b else 1 - y) * (z if c else 1 - z)
-                        value += weight * corner(i + a, j + b, k + c, seed)
+                        # numba widens uint32 products to 64 bits; the casts bring the hash back to 32
+                        p, q, r = uint32(i + a) * 73856093, uint32(j + b) * 19349663, uint32(k + c) * 83492791
+                        h = uint32(p ^ q ^ r ^ seed)
+                        h = uint32((h ^ (h >> 16)) * 0x7FEB352D)
+                        h = uint32((h ^ (h >> 15)) * 0x846CA68B)
+                        value += weight * (uint32(h ^ (h >> 16)) / 4294967295.0)
             out[n] = value
         return out
 

@@ -2,6 +2,8 @@
 
 import json
 import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -411,3 +413,12 @@ def test_noise_is_smooth_bounded_and_seeded():
     fractal = fractal_noise(points, 7, 10.0)
     assert fractal.min() >= 0
     assert fractal.max() <= 1
+
+
+def test_the_compiled_noise_is_found_again_by_the_next_process(tmp_path):
+    code = (
+        "import numpy as np; from ihbench.datasets.standin.noise import value_noise as v; v(np.zeros((1, 3)), 0, 1.0)"
+    )
+    for _ in range(2):
+        subprocess.run([sys.executable, "-c", code], env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}, check=True)
+    assert len(list(tmp_path.rglob("noise*.nbc"))) == 1
