@@ -41,13 +41,17 @@ class PosedField:
     avatar: HumanNerfAvatar = field(repr=False)
     weights: BoneWeights
     pose: Tensor  # [69] rad, for the non-rigid network
+    by_torch: bool = False  # look weights up by `grid_sample`, for every bone everywhere
 
     def likelihood(self, rays: Rays, depths: Tensor) -> Tensor:
         return self.weights.likelihood(rays, depths, self.avatar.config.least_weight)
 
     def values(self, points: Tensor) -> FieldValues:
         avatar, config = self.avatar, self.avatar.config
-        likelihood, places = self.weights.located(points, config.least_weight)
+        if self.by_torch:
+            likelihood, places = self.weights.located_by_torch(points)
+        else:
+            likelihood, places = self.weights.located(points, config.least_weight)
         if avatar.non_rigid is not None:
             places = places + avatar.non_rigid(places, self.pose, avatar.window)
         rgb, raw = avatar.canonical(places)

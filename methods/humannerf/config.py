@@ -139,16 +139,17 @@ ON_A_CPU = HumanNerfConfig(
     pose_width=128,
     weight_code=64,
     weight_channels=128,
-    samples=96,
+    samples=64,
+    least=1e-2,
     patches=2,
-    lr=2e-3,
-    lr_motion=1e-3,
+    lr=3e-3,
+    lr_motion=3e-3,
     lr_non_rigid=5e-4,
     lr_poses=2e-4,
 )
 
 PAPER = HumanNerfConfig()
-QUICK = in_steps(ON_A_CPU, 400)
+QUICK = in_steps(ON_A_CPU, 600)
 SMOKE = replace(
     in_steps(ON_A_CPU, 40),
     depth=4,

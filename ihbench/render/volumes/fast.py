@@ -33,7 +33,7 @@ class Skipping:
     least: float = 1e-3  # likelihood below which a sample is empty; 0: only what is exactly 0
     stop: float = 1e-3  # when drawing, a ray that lets through less than this is done; 0: none is
     block: int = 16  # samples between two looks at what is let through
-    portion: int = 8192  # rays at a time
+    portion: int = 2048  # rays at a time: what their samples need in the networks stays near the processor
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ def box_rays(
     camera: Camera,
     box: tuple[Tensor, Tensor],
     frame: tuple[Array, Array] | None = None,
-    portion: int = 8192,
+    portion: int = 2048,
 ) -> Iterator[tuple[Tensor, Rays, Tensor, Tensor]]:
     """Rays of a picture that meet a box, in portions: numbers of the pixels [N], rays, near and far [N]."""
     low, high = box

@@ -1,4 +1,5 @@
-"""The volume renderer's twin: float64, ray by ray, every sample evaluated, formulas as they are written.
+"""The volume renderer's twin: float64, ray by ray, every sample evaluated, formulas as they are written; and the
+plain dense renderer.
 
 α_s = (1 - exp(-σ_s δ_s)) f_s, T_s = Π_{u<s} (1 - α_u + 1e-10), colour = Σ T_s α_s c_s + (1 - Σ T_s α_s) background
 (HumanNeRF, core/nets/human_nerf/network.py:176-201).
@@ -9,7 +10,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ihbench.render.volumes.compositing import CLEAR
+from ihbench.render.volumes.compositing import CLEAR, Composited, alpha_composite
+from ihbench.render.volumes.fast import sample_opacity
 from ihbench.render.volumes.field import Field
 from ihbench.render.volumes.rays import Rays
 
@@ -37,3 +39,16 @@ def reference_rays(
         alphas.append(alpha)
         behind.append(far)
     return torch.stack(colors), torch.stack(alphas), torch.stack(behind)
+
+
+def dense_rays(
+    field: Field,
+    rays: Rays,
+    depths: Tensor,  # [N, S] m
+    lengths: Tensor,  # [N, S] m
+) -> Composited:
+    """The renderer that everybody writes first: every sample of every ray in one batch, in the rays' own float type.
+    What the fast one is timed against."""
+    values = field.values(rays.points(depths).flatten(0, 1))
+    alpha = sample_opacity(values, lengths.flatten()).view_as(depths)
+    return alpha_composite(alpha, values.rgb.view(*depths.shape, 3), depths)
