@@ -149,7 +149,7 @@ ON_A_CPU = HumanNerfConfig(
 )
 
 PAPER = HumanNerfConfig()
-QUICK = in_steps(ON_A_CPU, 600)
+QUICK = replace(in_steps(ON_A_CPU, 400), steps=600)
 SMOKE = replace(
     in_steps(ON_A_CPU, 40),
     depth=4,
