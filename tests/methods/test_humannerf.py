@@ -13,7 +13,7 @@ from ihbench.clock.progress import Progress
 from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput, Diverged
 from ihbench.methods.humannerf.avatar import HumanNerfAvatar
-from ihbench.methods.humannerf.config import PROFILES, QUICK, SMOKE, leave_out
+from ihbench.methods.humannerf.config import EARLY, PAPER, PROFILES, QUICK, SMOKE, leave_out
 from ihbench.methods.humannerf.fitting import MOST_RESTARTS, HumanNerfFit, restarted
 from ihbench.methods.humannerf.method import HumanNerfMethod
 from ihbench.methods.humannerf.stress import CASES, TINY
@@ -262,8 +262,10 @@ def test_profiles_and_what_a_scene_does_not_need():
     assert list(PROFILES) == ["smoke", "quick", "paper"]
     for name in PROFILES:
         assert spec.profile(name) == PROFILES[name]
-    assert QUICK.kick_in / QUICK.steps == pytest.approx(0.025, abs=2e-3)
-    assert QUICK.full_band / QUICK.steps == pytest.approx(0.125, abs=2e-3)
+    for name in ("kick_in", "full_band"):  # at the released shares of the steps in which rates fall to a tenth
+        share, released = (getattr(each, name) / each.decay_steps for each in (QUICK, PAPER))
+        assert share == pytest.approx(released, abs=1e-3)
+    assert min(QUICK.guard) == EARLY
     assert QUICK.patch_px >= 32
     still, moving = (cast(Any, SimpleNamespace(motion_deg=deg)) for deg in (1.0, 30.0))
     (omission,) = leave_out(QUICK, still)
