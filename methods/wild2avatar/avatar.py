@@ -16,16 +16,16 @@ from ihbench.camera import Camera
 from ihbench.config_fields import read
 from ihbench.fit.avatar_files import read_avatar, write_avatar
 from ihbench.fit.training_poses import PoseTables, TrainingPoses
-from ihbench.methods.wild2avatar.body_fit import fit_to_body
-from ihbench.methods.wild2avatar.canonical_body import CanonicalBody
 from ihbench.methods.wild2avatar.config import Wild2AvatarConfig
-from ihbench.methods.wild2avatar.human_field import HumanField
-from ihbench.methods.wild2avatar.human_rays import HumanMarch, march_human
-from ihbench.methods.wild2avatar.inverse_skinning import PosedBody
-from ihbench.methods.wild2avatar.near_body import near_body, unit_rays
-from ihbench.methods.wild2avatar.ray_samples import SampleCounts
+from ihbench.methods.wild2avatar.person.body_fit import fit_to_body
+from ihbench.methods.wild2avatar.person.canonical_body import CanonicalBody
+from ihbench.methods.wild2avatar.person.human_field import HumanField
+from ihbench.methods.wild2avatar.person.human_rays import HumanMarch, march_human
+from ihbench.methods.wild2avatar.person.inverse_skinning import PosedBody
+from ihbench.methods.wild2avatar.person.near_body import near_body, unit_rays
+from ihbench.methods.wild2avatar.person.ray_samples import SampleCounts
+from ihbench.methods.wild2avatar.person.sdf_network import SdfNetwork
 from ihbench.methods.wild2avatar.scene_network import SceneNetwork
-from ihbench.methods.wild2avatar.sdf_network import SdfNetwork
 
 KIND = "wild2avatar"
 RAYS_AT_ONCE = 4096  # when drawing

@@ -16,11 +16,11 @@ from ihbench.clock.progress import Progress
 from ihbench.errors import Diverged
 from ihbench.fit.optimisation import Optimisation, ParameterGroup
 from ihbench.methods.wild2avatar.avatar import Wild2AvatarAvatar
-from ihbench.methods.wild2avatar.human_rays import HumanMarch, HumanRays, march_human
-from ihbench.methods.wild2avatar.inverse_skinning import PosedBody
 from ihbench.methods.wild2avatar.layers import Layer, background_layer, occlusion_layer, together
 from ihbench.methods.wild2avatar.losses import FULL, Rays, eikonal, ray_losses
-from ihbench.methods.wild2avatar.near_body import unit_rays
+from ihbench.methods.wild2avatar.person.human_rays import HumanMarch, HumanRays, march_human
+from ihbench.methods.wild2avatar.person.inverse_skinning import PosedBody
+from ihbench.methods.wild2avatar.person.near_body import unit_rays
 from ihbench.methods.wild2avatar.spec import STATE
 from ihbench.methods.wild2avatar.target import Target, middle, prepare_target
 from ihbench.methods.wild2avatar.three_parts import FARTHEST_CAMERA, ThreeParts, inner_radius, three_parts

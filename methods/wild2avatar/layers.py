@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ihbench.methods.wild2avatar.human_rays import HumanRays
+from ihbench.methods.wild2avatar.person.human_rays import HumanRays
 from ihbench.methods.wild2avatar.scene_network import SceneNetwork
 from ihbench.methods.wild2avatar.three_parts import ThreeParts
 from ihbench.render.volumes.compositing import ray_weights

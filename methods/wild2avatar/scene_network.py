@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ihbench.methods.wild2avatar.activation import sharp_softplus
+from ihbench.methods.wild2avatar.person.activation import sharp_softplus
 from ihbench.nets.positional_encoding import positional_encoding
 
 CODE = 32

@@ -12,7 +12,7 @@ from torch import Tensor
 from ihbench.body import Body
 from ihbench.camera import Camera
 from ihbench.fit.body_box import body_box
-from ihbench.methods.wild2avatar.near_body import near_body
+from ihbench.methods.wild2avatar.person.near_body import near_body
 from ihbench.render.zbuffer import rasterize
 from ihbench.scene.contracts import MaskState, TrainView
 

@@ -35,17 +35,15 @@ BOXED = replace(
     sdf_width=32,
     sdf_depth=3,
     body_fit=150,
-    beta=0.004,
+    beta=0.008,
     colour_width=32,
     scene_width=64,
     scene_depth=3,
     scene_frequencies=6,
     scene_samples=6,
     refresh_epochs=10,
-    ramp_epochs=40.0,
     lr=0.01,
     lr_sdf=5e-4,
-    lr_beta=5e-5,
 )
 
 
@@ -126,7 +124,8 @@ def test_check_5_the_occluders_layer_has_its_colour_where_it_hides_the_person():
 
 def test_check_5_the_persons_layer_is_complete():
     overlaps = [overlap(layers(k)["human"], shots()[k].complete) for k in BEHIND]
-    assert np.mean(overlaps) > 0.9
+    shown = [overlap(shots()[k].complete & ~shots()[k].boxed, shots()[k].complete) for k in BEHIND]
+    assert np.mean(overlaps) > 0.87 > np.mean(shown)
     for k in BEHIND:
         assert layers(k)["human"][shots()[k].boxed & shots()[k].complete].mean() > 0.9
 
@@ -144,7 +143,7 @@ def test_check_5_the_background_shows_no_box():
 def test_check_6_without_completeness_the_hidden_body_vanishes():
     """With Vid2Avatar's own term of rays inside the body off as well; with completeness it stands."""
     means = []
-    for changes in ({}, {"completeness": 0.0, "steps": 180}):
+    for changes in ({}, {"completeness": 0.0, "steps": 450}):
         hidden = [layers(k, **changes)["human"][shots()[k].boxed & shots()[k].complete].mean() for k in BEHIND]
         means.append(np.mean(hidden))
     assert means[0] >= 0.9
@@ -153,7 +152,7 @@ def test_check_6_without_completeness_the_hidden_body_vanishes():
 
 def test_check_6_without_the_occluders_loss_the_person_is_painted_in_its_colour():
     excess = []
-    for changes in ({}, {"occlusion_loss": 0.0, "sparsity": 0.0, "steps": 150}):
+    for changes in ({}, {"occlusion_loss": 0.0, "sparsity": 0.0, "steps": 100}):
         each = []
         for k in BEHIND:
             own = layers(k, **changes)
@@ -168,7 +167,7 @@ def test_check_6_without_the_occluders_loss_the_person_is_painted_in_its_colour(
 
 
 def test_check_7_with_nothing_hidden_the_layer_is_empty_and_the_fit_is_that_of_two_parts():
-    some = {"steps": 60}
+    some = {"steps": 120}
     seen = [layers(k, hidden=False, **some)["occluder"] for k in range(5)]
     assert np.mean(seen) < 0.01
     psnr = []
@@ -347,7 +346,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_another(views):
 
 def test_a_start_that_is_kept_is_the_start_that_is_fitted(views, monkeypatch):
     """The body fit is done once for the same network and body; the next has its result, to the bit."""
-    from ihbench.methods.wild2avatar import body_fit
+    from ihbench.methods.wild2avatar.person import body_fit
 
     kept = everything(begun(TINY, training_set(views)))
     monkeypatch.setattr(body_fit, "_kept", {})

@@ -11,17 +11,17 @@ import torch.nn.functional as F
 from scipy.spatial import KDTree
 
 from ihbench.clock.threads import one_torch_thread
-from ihbench.methods.wild2avatar.activation import sharp_softplus
-from ihbench.methods.wild2avatar.body_fit import fit_to_body
-from ihbench.methods.wild2avatar.canonical_body import BodySurface, CanonicalBody
 from ihbench.methods.wild2avatar.config import PAPER, SMOKE
-from ihbench.methods.wild2avatar.human_field import HumanField
-from ihbench.methods.wild2avatar.human_rays import HumanMarch, HumanRays, march_human
-from ihbench.methods.wild2avatar.inverse_skinning import PosedBody
 from ihbench.methods.wild2avatar.layers import Layer, background_layer, occlusion_layer, together
 from ihbench.methods.wild2avatar.losses import LEAST, Rays, binary_entropy, eikonal, ray_losses
-from ihbench.methods.wild2avatar.near_body import REACH, near_body, near_body_plain, unit_rays
-from ihbench.methods.wild2avatar.ray_samples import (
+from ihbench.methods.wild2avatar.person.activation import sharp_softplus
+from ihbench.methods.wild2avatar.person.body_fit import fit_to_body
+from ihbench.methods.wild2avatar.person.canonical_body import BodySurface, CanonicalBody
+from ihbench.methods.wild2avatar.person.human_field import HumanField
+from ihbench.methods.wild2avatar.person.human_rays import HumanMarch, HumanRays, march_human
+from ihbench.methods.wild2avatar.person.inverse_skinning import PosedBody
+from ihbench.methods.wild2avatar.person.near_body import REACH, near_body, near_body_plain, unit_rays
+from ihbench.methods.wild2avatar.person.ray_samples import (
     ERROR,
     SampleCounts,
     by_density,
@@ -30,8 +30,8 @@ from ihbench.methods.wild2avatar.ray_samples import (
     least_spread,
     ray_samples,
 )
+from ihbench.methods.wild2avatar.person.sdf_network import RADIUS, SdfNetwork
 from ihbench.methods.wild2avatar.scene_network import SceneNetwork
-from ihbench.methods.wild2avatar.sdf_network import RADIUS, SdfNetwork
 from ihbench.methods.wild2avatar.target import prepare_target
 from ihbench.methods.wild2avatar.three_parts import inner_radius, three_parts
 from ihbench.render.volumes.density_laws import laplace_density, opacity
@@ -58,7 +58,7 @@ def canonical():
 def like_the_body():
     """A field fitted to the body, and nothing else, with a surface that is not soft."""
     field = HumanField(replace(SMOKE, sdf_width=64, beta=0.005), torch.Generator().manual_seed(0))
-    fit_to_body(field.sdf, canonical(), 0, 300)
+    fit_to_body(field.sdf, canonical(), 0, 420)
     return field
 
 

@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from ihbench.fit.big_pose.deformation import inverse
-from ihbench.methods.wild2avatar.canonical_body import CanonicalBody
+from ihbench.methods.wild2avatar.person.canonical_body import CanonicalBody
 
 AT_ONCE = 16_384  # points whose distances to all vertices are in memory together, on a GPU
 

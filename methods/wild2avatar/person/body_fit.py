@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ihbench.methods.wild2avatar.canonical_body import BodySurface, CanonicalBody
-from ihbench.methods.wild2avatar.sdf_network import SdfNetwork
+from ihbench.methods.wild2avatar.person.canonical_body import BodySurface, CanonicalBody
+from ihbench.methods.wild2avatar.person.sdf_network import SdfNetwork
 
 RATE, LAST_SHARE = 5e-3, 0.02  # of Adam, and what is left of it at the end
 POINTS = 512  # of each kind in a step

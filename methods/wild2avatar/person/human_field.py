@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ihbench.methods.wild2avatar.sdf_network import POSE, SdfNetwork
+from ihbench.methods.wild2avatar.person.sdf_network import POSE, SdfNetwork
 
 if TYPE_CHECKING:
     from ihbench.methods.wild2avatar.config import Wild2AvatarConfig

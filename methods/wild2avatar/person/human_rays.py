@@ -8,11 +8,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ihbench.methods.wild2avatar.human_field import HumanField
-from ihbench.methods.wild2avatar.inverse_skinning import PosedBody
-from ihbench.methods.wild2avatar.near_body import REACH
-from ihbench.methods.wild2avatar.ray_samples import SampleCounts, ray_samples
-from ihbench.methods.wild2avatar.sdf_network import SdfNetwork
+from ihbench.methods.wild2avatar.person.human_field import HumanField
+from ihbench.methods.wild2avatar.person.inverse_skinning import PosedBody
+from ihbench.methods.wild2avatar.person.near_body import REACH
+from ihbench.methods.wild2avatar.person.ray_samples import SampleCounts, ray_samples
+from ihbench.methods.wild2avatar.person.sdf_network import SdfNetwork
 from ihbench.render.volumes.compositing import ray_weights, scattered_composite
 from ihbench.render.volumes.density_laws import laplace_density, opacity
 from ihbench.render.volumes.rays import Rays

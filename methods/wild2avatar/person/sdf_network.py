@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrizations import weight_norm
 
-from ihbench.methods.wild2avatar.activation import sharp_softplus
+from ihbench.methods.wild2avatar.person.activation import sharp_softplus
 from ihbench.nets.positional_encoding import positional_encoding
 
 RADIUS = 0.6  # m
