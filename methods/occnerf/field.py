@@ -8,12 +8,14 @@ multiplied, and a deformation that moved the place (the released code has an idl
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from ihbench.methods.occnerf.canonical_surface import NEIGHBOURS, OF_A_VERTEX
+from ihbench.methods.occnerf.canonical_surface import NEIGHBOURS, OF_A_VERTEX, CanonicalSurface
+from ihbench.methods.occnerf.config import OccNerfConfig
+from ihbench.methods.occnerf.decoder import SurfaceDecoder
 from ihbench.methods.occnerf.projection import (
     SAMPLE_SPAN,
     VERTEX_SPAN,
@@ -23,13 +25,25 @@ from ihbench.methods.occnerf.projection import (
 )
 from ihbench.methods.occnerf.visibility import neighbour_weights
 from ihbench.nets.bone_lookups import BoneWeights
+from ihbench.nets.hash_grid_4d import HashGrid4d
 from ihbench.nets.weighted_rows import weighted_rows
 from ihbench.render.volumes.density_laws import softplus_density
 from ihbench.render.volumes.field import FieldValues
 from ihbench.render.volumes.rays import Rays
 
-if TYPE_CHECKING:
-    from ihbench.methods.occnerf.avatar import OccNerfAvatar
+
+class OnSurface(Protocol):
+    """What the field is made of: an avatar."""
+
+    config: OccNerfConfig
+    surface: CanonicalSurface
+    grid: HashGrid4d
+    decoder: SurfaceDecoder
+    counters: Tensor  # [V]
+
+    def displaced(self) -> Tensor:
+        """[V, 3] m."""
+        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +55,7 @@ class SurfaceValues(FieldValues):
     canonical: Tensor  # [M, 3] m
 
 
-def vertex_features(avatar: OccNerfAvatar) -> Tensor:
+def vertex_features(avatar: OnSurface) -> Tensor:
     """[V, 35]: hash features of each displaced vertex against its three nearest base vertices, and where it is.
     Differentiable in the displacements, too."""
     surface, moved = avatar.surface, avatar.displaced()
@@ -63,7 +77,7 @@ class Decoded:
 
 
 def decoded(
-    avatar: OccNerfAvatar,
+    avatar: OnSurface,
     features: Tensor,  # [V, 35]
     places: Tensor,  # [M, 3] m, canonical
 ) -> Decoded:
@@ -90,7 +104,7 @@ def decoded(
 class PosedField:
     """The field as it is seen in one pose, in the root's frame; a `render.volumes.field.Field`."""
 
-    def __init__(self, avatar: OccNerfAvatar, bones: BoneWeights, features: Tensor):
+    def __init__(self, avatar: OnSurface, bones: BoneWeights, features: Tensor):
         self.avatar, self.bones, self.features = avatar, bones, features
 
     def likelihood(self, rays: Rays, depths: Tensor) -> Tensor:
