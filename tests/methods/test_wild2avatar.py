@@ -141,13 +141,14 @@ def test_check_5_the_background_shows_no_box():
 
 
 def test_check_6_without_completeness_the_hidden_body_vanishes():
-    """With Vid2Avatar's own term of rays inside the body off as well; with completeness it stands."""
-    means = []
-    for changes in ({}, {"completeness": 0.0, "steps": 450}):
+    """Soon, where the surface learns fast; with the term it stands there, and in the long fit."""
+    fast, means = {"lr_sdf": 2e-3, "steps": 100}, []
+    for changes in ({}, fast, fast | {"completeness": 0.0}):
         hidden = [layers(k, **changes)["human"][shots()[k].boxed & shots()[k].complete].mean() for k in BEHIND]
         means.append(np.mean(hidden))
     assert means[0] >= 0.9
-    assert means[1] < 0.6
+    assert means[1] > 0.8
+    assert means[2] < 0.6
 
 
 def test_check_6_without_the_occluders_loss_the_person_is_painted_in_its_colour():
@@ -167,7 +168,7 @@ def test_check_6_without_the_occluders_loss_the_person_is_painted_in_its_colour(
 
 
 def test_check_7_with_nothing_hidden_the_layer_is_empty_and_the_fit_is_that_of_two_parts():
-    some = {"steps": 120}
+    some = {"steps": 100}
     seen = [layers(k, hidden=False, **some)["occluder"] for k in range(5)]
     assert np.mean(seen) < 0.01
     psnr = []
