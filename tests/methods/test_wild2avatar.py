@@ -168,7 +168,7 @@ def test_check_6_without_the_occluders_loss_the_person_is_painted_in_its_colour(
 
 
 def test_check_7_with_nothing_hidden_the_layer_is_empty_and_the_fit_is_that_of_two_parts():
-    some = {"steps": 100}
+    some = {"steps": 120}
     seen = [layers(k, hidden=False, **some)["occluder"] for k in range(5)]
     assert np.mean(seen) < 0.01
     psnr = []
@@ -179,7 +179,7 @@ def test_check_7_with_nothing_hidden_the_layer_is_empty_and_the_fit_is_that_of_t
             rgb, _ = avatar.render(CAMERA, shot.view.body_pose)
             errors.append(np.square(rgb - shot.view.image / 255)[shot.complete])
         psnr.append(-10 * np.log10(np.concatenate(errors).mean()))
-    assert abs(psnr[0] - psnr[1]) < 0.2
+    assert abs(psnr[0] - psnr[1]) < 0.4  # .08 here; so short a fit differs by .2 from one step to the next
 
 
 # ------------------------------------------------------------------------------------------------ check 8: drawing
