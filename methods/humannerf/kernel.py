@@ -54,7 +54,7 @@ class Scene:
 
 
 @cache
-def a_scene(size: int = SIZE, steps: int = FITTED) -> Scene:
+def fitted(steps: int = FITTED) -> HumanNerfAvatar:
     """Six sides of a drawn person, fitted with the networks of the quick profile."""
     from ihbench.stress.drawn_capture import a_camera, a_pose, the_body, train_view
 
@@ -64,8 +64,15 @@ def a_scene(size: int = SIZE, steps: int = FITTED) -> Scene:
     config = replace(in_steps(QUICK, steps), lpips=0.0, mse=1.0, lr=5e-3, lr_motion=5e-3, least=1e-3)
     avatar = HumanNerfAvatar(config, the_body(), np.zeros(10), 0)
     HumanNerfFit(avatar, TrainingSet(views, the_body(), WHITE, "kernel"), 0, Ledger()).run(Progress.silent())
+    return avatar
+
+
+def scene_of(avatar: HumanNerfAvatar, size: int = SIZE) -> Scene:
+    """An avatar in a natural pose."""
+    from ihbench.stress.drawn_capture import a_camera, a_pose
+
     pose, camera = a_pose(0.5, 0.2), a_camera(0.3, size)
-    box = PosedBox.around(the_body(), pose)
+    box = PosedBox.around(avatar.body, pose)
     parts = list(box_rays(camera, box.ends(torch.float32, "cpu"), box.frame))
     rays = Rays(*(torch.cat([getattr(part[1], name) for part in parts]) for name in ("origins", "directions")))
     near, far = (torch.cat([part[k] for part in parts]) for k in (2, 3))
@@ -77,7 +84,7 @@ def volume_rows(repeats: int) -> list[Row]:
     """A picture by the fast renderer, by the dense one and by the float64 twin, and a patch forward and back by the
     first two. Value errors are the largest of colours on white against the twin's, on rays that show something;
     gradient errors are those of all parameters against the dense renderer's in float64, relative to their norm."""
-    scene = a_scene()
+    scene = scene_of(fitted())
     return [*_picture(scene, repeats), *_patch(scene, repeats)]
 
 
@@ -114,7 +121,7 @@ def _picture(scene: Scene, repeats: int) -> list[Row]:
     timings: dict[str, list[Sample]] = interleave(
         {name: lambda f=f: timed(f) for name, f in steps.items()}, repeats, warm_up=1
     )
-    case, rows = f"picture {SIZE}², {len(numbers)} rays", []
+    case, rows = f"picture {scene.camera.width}², {len(numbers)} rays", []
     for name, samples in timings.items():
         error = float((steps[name]()[numbers[chosen]] - truth).abs().max())
         rows.append(row_of("volume", case, name, samples, peak_mib(steps[name]), error))

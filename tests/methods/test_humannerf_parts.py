@@ -13,6 +13,7 @@ from ihbench.camera import Camera
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.threads import one_torch_thread
 from ihbench.fit.rays.ray_target import PosedBox
+from ihbench.methods.humannerf import kernel
 from ihbench.methods.humannerf.avatar import HumanNerfAvatar, PosedField
 from ihbench.methods.humannerf.config import PAPER, SMOKE
 from ihbench.methods.humannerf.fitting import HumanNerfFit
@@ -224,6 +225,20 @@ def test_pictures_are_the_float64_twins():
     assert np.abs(rgb - shown.view(20, 20, 3).numpy()).max() < 1 / 255
     assert 0.05 < alpha.mean() < 0.9
     assert alpha.max() > 0.99
+
+
+def test_kernel_rows_are_within_a_grey_level(monkeypatch):
+    """Of a small picture; what they take is for `ihbench kernels`."""
+    for name, value in (("SAMPLES", 32), ("TWIN_RAYS", 6), ("PATCH", 4)):
+        monkeypatch.setattr(kernel, name, value)
+    monkeypatch.setattr(kernel, "fitted", lambda: dense(least=1e-3))
+    monkeypatch.setattr(kernel, "scene_of", lambda avatar, scene_of=kernel.scene_of: scene_of(avatar, 16))
+    rows = kernel.volume_rows(1)
+    assert [row.case.split()[0] for row in rows] == ["picture"] * 3 + ["patch"] * 2
+    for row in rows:
+        assert row.value_error is not None
+        assert row.value_error < 1 / 255
+        assert row.gradient_error is None or row.gradient_error < 2e-2
 
 
 # ------------------------------------------------------------------------------------- check 7: the occluded slab
