@@ -119,8 +119,8 @@ class HumanNerfAvatar(nn.Module):
         pose = torch.from_numpy(np.array(body_pose.pose[1:])).to(weight)
         joints = torch.from_numpy(np.array(self.body.shaped(body_pose.betas)[1])).to(weight)
         maps = bone_maps(self.rotations(pose, corrected), joints, self.joints.to(weight), self.parents)
-        volume = self.motion() if volume is None else volume
-        bones = BoneWeights(volume, self.motion.low, self.motion.high, maps)
+        decoded: Tensor = self.motion() if volume is None else volume
+        bones = BoneWeights(decoded, self.motion.low, self.motion.high, maps)
         return PosedField(self, bones, pose.flatten() + POSE_SHIFT)
 
     # --- drawing ---

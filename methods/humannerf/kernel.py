@@ -74,8 +74,8 @@ def scene_of(avatar: HumanNerfAvatar, size: int = SIZE) -> Scene:
     pose, camera = a_pose(0.5, 0.2), a_camera(0.3, size)
     box = PosedBox.around(avatar.body, pose)
     parts = list(box_rays(camera, box.ends(torch.float32, "cpu"), box.frame))
-    rays = Rays(*(torch.cat([getattr(part[1], name) for part in parts]) for name in ("origins", "directions")))
-    near, far = (torch.cat([part[k] for part in parts]) for k in (2, 3))
+    rays = Rays(torch.cat([part[1].origins for part in parts]), torch.cat([part[1].directions for part in parts]))
+    near, far = torch.cat([part[2] for part in parts]), torch.cat([part[3] for part in parts])
     depths = even_depths(near, far, SAMPLES)
     return Scene(avatar, pose, camera, box, rays, depths, segment_lengths(depths, rays.lengths))
 

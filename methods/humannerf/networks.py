@@ -84,6 +84,7 @@ def _layer(inputs: int, outputs: int, gain: float, generator: torch.Generator) -
 def _through(layers: nn.ModuleList | Sequence, x: Tensor, encoded: Tensor, again: int) -> Tensor:
     """Layers with ReLU; the encoding, in front, joins what goes into number `again`, unless that is the first."""
     for k, layer in enumerate(layers):
+        assert isinstance(layer, nn.Linear)
         if k == again and layer.in_features != x.shape[1]:
             of_encoded, of_hidden = layer.weight.split([encoded.shape[1], x.shape[1]], 1)
             x = (F.linear(encoded, of_encoded, layer.bias) + F.linear(x, of_hidden)).relu()
