@@ -12,6 +12,7 @@ from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput, Diverged
+from ihbench.fit.rays.patch_loss import patch_distance
 from ihbench.methods.humannerf.avatar import HumanNerfAvatar
 from ihbench.methods.humannerf.config import EARLY, PAPER, PROFILES, QUICK, SMOKE, leave_out
 from ihbench.methods.humannerf.fitting import MOST_RESTARTS, HumanNerfFit, restarted
@@ -63,6 +64,11 @@ def whole():
 # ------------------------------------------------------------------------------------------------------- the loss
 
 
+def distance_of(fit):
+    config = fit.avatar.config
+    return patch_distance(config.lpips_net, config.without_lpips, fit.avatar.device, fit.ledger)
+
+
 def test_the_loss_is_squared_error_and_a_distance_of_patches(views):
     training = training_set(views)
     values = {}
@@ -72,7 +78,7 @@ def test_the_loss_is_squared_error_and_a_distance_of_patches(views):
         "both": {"mse": 0.2, "lpips": 0.7},
     }.items():
         fit = a_fit(training, patches=2, **changes)
-        fit._perceptual = fit._distance(replace(fit.avatar.config, lpips=1.0)) if changes["lpips"] else None
+        fit._perceptual = distance_of(fit) if changes["lpips"] else None
         with torch.no_grad():
             values[name] = fit._loss(1).item()
     assert all(value > 0 for value in values.values())
@@ -80,16 +86,16 @@ def test_the_loss_is_squared_error_and_a_distance_of_patches(views):
 
 
 def test_without_weights_another_distance_stands_for_lpips_and_the_record_says_so(views, monkeypatch):
-    monkeypatch.setattr("ihbench.methods.humannerf.fitting.perceptual", lambda net, device: f"no weights of {net}")
+    monkeypatch.setattr("ihbench.fit.rays.patch_loss.perceptual", lambda net, device: f"no weights of {net}")
     for instead, words in (("ssim", "ssim stands for it"), ("none", "nothing stands for it")):
         ledger = Ledger()
         fitted(training_set(views), ledger=ledger, lpips=1.0, without_lpips=instead, steps=1)
         assert events(ledger, "left_out") == [{"what": "lpips term", "reason": f"no weights of vgg; {words}"}]
     monkeypatch.setattr(
-        "ihbench.methods.humannerf.fitting.perceptual", lambda net, device: lambda rgb, image: rgb.mean() * 0 + 5
+        "ihbench.fit.rays.patch_loss.perceptual", lambda net, device: lambda rgb, image: rgb.mean() * 0 + 5
     )
     fit = a_fit(training_set(views), lpips=2.0, mse=0.0, patches=3)
-    fit._perceptual = fit._distance(fit.avatar.config)
+    fit._perceptual = distance_of(fit)
     assert fit._loss(0).item() == 10.0
 
 
