@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -223,9 +224,28 @@ def test_an_album_is_made_where_processes_cannot_share_memory(tmp_path, monkeypa
         raise OSError(38, "Function not implemented")
 
     monkeypatch.setattr(crop_dataset, "ProcessPoolExecutor", refuses)
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
     store = CropDataset(tmp_path, "procedural", 2, SIDE)
-    store.make(0, 2, QUIET)
-    assert len(list(store.pages(0, 2))) == 1
+    store.make(0, 4, QUIET)
+    assert len(list(store.pages(0, 4))) == 2
+
+
+def test_albums_are_made_by_processes_that_begin_afresh(tmp_path, monkeypatch):
+    """A fork of this one, which has torch's and numba's threads, would wait for them forever."""
+    asked = []
+
+    def threads(workers, context, initializer):
+        asked.append((workers, context.get_start_method(), initializer))
+        return ThreadPoolExecutor(1)
+
+    monkeypatch.setattr(crop_dataset, "ProcessPoolExecutor", threads)
+    monkeypatch.setattr("os.cpu_count", lambda: 8)
+    store = CropDataset(tmp_path, "procedural", 2, SIDE)
+    store.make(0, 4, QUIET)
+    assert asked == [(2, "spawn", crop_dataset._begin_worker)]
+    assert [page.person.tolist() for page in store.pages(0, 4)] == [[0, 0, 1, 1]] * 2
+    store.make(0, 6, QUIET)
+    assert len(asked) == 1, "one page is not worth a process"
 
 
 def test_album_pages_are_written_whole_and_read_back(tmp_path):

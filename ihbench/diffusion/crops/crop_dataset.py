@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -88,16 +89,16 @@ class CropDataset:
         missing = [s for s in range(start, start + count, PAGE) if not self.path(s).is_file()]
         if not missing:
             return
-        work = [(self.people, s, self.each, self.size, self.path(s)) for s in missing]
+        work = [(self.people, s, PAGE, self.each, self.size, self.path(s)) for s in missing]
         with progress.task("photographing people", len(missing) * PAGE) as task, ExitStack() as stack:
-            try:
-                workers = min(os.cpu_count() or 1, len(missing))
-                pool = stack.enter_context(ProcessPoolExecutor(workers, initializer=_begin_worker))
-            except (OSError, ImportError, NotImplementedError):  # no shared memory here, as in some sandboxes
-                written = map(_write_page, work)
-            else:
-                written = pool.map(_write_page, work)
-            for _ in written:
+            workers, side_by_side = min(os.cpu_count() or 1, len(missing)), map
+            # where there is no shared memory, as in some sandboxes, this process takes all of them
+            with suppress(OSError, ImportError, NotImplementedError):
+                if workers > 1:
+                    # a fork of a process whose libraries have threads waits for them forever
+                    pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=_begin_worker)
+                    side_by_side = stack.enter_context(pool).map
+            for _ in side_by_side(_write_page, work):
                 task.advance(PAGE)
 
     def pages(self, start: int, count: int) -> Iterator[Page]:
@@ -110,9 +111,9 @@ def _begin_worker() -> None:
     begin_on_one_thread()
 
 
-def _write_page(work: tuple[str, int, int, int, Path]) -> None:
-    people, start, each, size, path = work
-    page = make_page(people, start, PAGE, each, size)
+def _write_page(work: tuple[str, int, int, int, int, Path]) -> None:
+    people, start, count, each, size, path = work
+    page = make_page(people, start, count, each, size)
     words = np.array(["\n".join(phrases) for phrases in page.phrases])
     arrays = {name: getattr(page, name) for name in (*COLUMNS, "traits")}
     write_npz(path, {"phrases": words, **arrays})
