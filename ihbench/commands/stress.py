@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import time
+import os
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -10,6 +10,7 @@ import tyro
 
 from ihbench.commands.options.parse import options
 from ihbench.commands.options.printing import Printing
+from ihbench.config_fields import Within
 
 
 @dataclass(frozen=True)
@@ -18,6 +19,8 @@ class StressOptions(Printing):
     """Groups to run: metrics, geometry, splat, data, training, ranking; none means all."""
     case: tuple[str, ...] = ()
     """Only the cases of these names."""
+    workers: Annotated[int, Within(1, 1024)] = 1
+    """Processes that run cases side by side."""
 
 
 def main(argv: list[str]) -> int:
@@ -29,10 +32,11 @@ def main(argv: list[str]) -> int:
     from ihbench.stress.run import chosen_cases, run_cases
     from ihbench.stress.table import blocks_of, data_of, failures
 
-    start, processor_start = time.perf_counter(), time.process_time()
+    start = os.times()
     cases = chosen_cases(chosen.group, chosen.case)
     with Progress().task("stress", len(cases)) as task:
-        outcomes = run_cases(cases, lambda outcome: task.advance())
-    seconds = time.perf_counter() - start, time.process_time() - processor_start
+        outcomes = run_cases(cases, lambda outcome: task.advance(), chosen.workers)
+    end = os.times()
+    seconds = end.elapsed - start.elapsed, sum(end[:4]) - sum(start[:4])  # of ended workers, too
     chosen.show(data_of(outcomes, *seconds), blocks_of(outcomes, *seconds))
     return 1 if failures(outcomes) else 0

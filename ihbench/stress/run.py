@@ -1,4 +1,4 @@
-"""Running cases one after the other."""
+"""Running cases, one after the other or side by side."""
 
 from __future__ import annotations
 
@@ -6,13 +6,18 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from functools import cache
 from importlib import import_module
+from multiprocessing import get_context
 
 from ihbench import registry
-from ihbench.clock.threads import one_torch_thread
+from ihbench.clock.interruption import end_with_parent
+from ihbench.clock.threads import begin_on_one_thread, one_torch_thread
 from ihbench.errors import BadInput
 from ihbench.scene.method_spec import usable_specs
-from ihbench.stress.case import Case, Outcome, Verdict, error_of
+from ihbench.stress.case import Answer, Case, Outcome, Verdict, error_of
 
 GROUPS = ("metrics", "geometry", "splat", "data", "training", "ranking")  # a module each, with a list CASES
 MODULES = (*GROUPS, "splat_general")  # and one more for a group that grew
@@ -43,14 +48,48 @@ def chosen_cases(groups: Sequence[str] = (), names: Sequence[str] = ()) -> list[
     return [case for case in cases if not names or case.name in names]
 
 
-def run_cases(cases: Sequence[Case], after_each: Callable[[Outcome], None] = lambda outcome: None) -> list[Outcome]:
-    """Run cases in order, on one torch thread."""
+def run_cases(
+    cases: Sequence[Case], after_each: Callable[[Outcome], None] = lambda outcome: None, workers: int = 1
+) -> list[Outcome]:
+    """Run cases, on one torch thread; the outcomes are in their order. With several workers registered cases run side
+    by side, in as many processes."""
+    if workers > 1 and len(cases) > 1:
+        return _side_by_side(cases, after_each, min(workers, len(cases)))
     outcomes = []
     with one_torch_thread():
         for case in cases:
             outcomes.append(run_case(case))
             after_each(outcomes[-1])
     return outcomes
+
+
+def _side_by_side(cases: Sequence[Case], after_each: Callable[[Outcome], None], workers: int) -> list[Outcome]:
+    outcomes = []
+    with ProcessPoolExecutor(workers, get_context("spawn"), initializer=_begin_worker) as pool:
+        # a case is a function, which does not travel: its name does, and its outcome comes back without it
+        for case, outcome in zip(cases, pool.map(_run_named, [case.name for case in cases]), strict=True):
+            outcomes.append(replace(outcome, case=case))
+            after_each(outcomes[-1])
+    return outcomes
+
+
+def _begin_worker() -> None:
+    end_with_parent()
+    begin_on_one_thread()
+
+
+def _run_named(name: str) -> Outcome:
+    case = _by_name()[name]
+    return replace(run_case(case), case=replace(case, function=_elsewhere))
+
+
+@cache
+def _by_name() -> dict[str, Case]:
+    return {case.name: case for case in all_cases()}
+
+
+def _elsewhere() -> Answer:
+    raise NotImplementedError("a case that was run in another process")
 
 
 def run_case(case: Case) -> Outcome:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import pickle
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from importlib import import_module
 
@@ -242,6 +244,22 @@ def test_the_command_prints_every_case_and_ends_well(two_cases, capsys):
     assert "known: off: nobody minds [error 0.2 beyond 0.1 (absolute)]" in out
     assert "allowed up to 0.5 abs: it is so" in out
     assert "KNOWN" in out
+
+
+def test_workers_bring_outcomes_in_the_cases_order(two_cases, monkeypatch, capsys):
+    """CI has real ones; here a process is a thread."""
+    monkeypatch.setattr(run, "ProcessPoolExecutor", lambda workers, context, initializer: ThreadPoolExecutor(workers))
+    run._by_name.cache_clear()
+    one, told = [{**o.row(), "seconds": 0} for o in run_cases(two_cases)], []
+    several = run_cases(two_cases, told.append, workers=2)
+    assert [{**o.row(), "seconds": 0} for o in several] == one
+    assert [o.case for o in several] == two_cases, "with their functions"
+    assert told == several
+    assert main(["stress", "--workers", "2"]) == 0
+    assert "2 cases (metrics 1, data 1): 1 passed, 1 known to fail" in capsys.readouterr().out
+    run._by_name.cache_clear()
+    assert pickle.dumps(run._run_named("fine")), "what comes back has no function of a method"
+    run._by_name.cache_clear()
 
 
 def test_the_command_ends_with_1_when_a_case_fails(two_cases, capsys):
