@@ -24,6 +24,12 @@ def discard_file(file: Path) -> None:
         file.unlink()
 
 
+def discard_empty(folder: Path) -> None:
+    """Remove a folder with nothing in it. One that holds somebody's files, or is gone already, is no error."""
+    with suppress(OSError):
+        folder.rmdir()
+
+
 def remove_written(folder: Path, ours: Ours) -> None:
     """Remove what the bench wrote below `folder`, and folders that this empties. The rest stays where it is; links
     are neither removed nor followed."""

@@ -77,8 +77,7 @@ class Snapshots:
         for name in (SNAPSHOT, WATCHED):
             removal.discard_file(self._folder / name)
         for folder in (*(self._folder / place for place in PLACES), self._folder):
-            with suppress(OSError):  # somebody else's files are in it, or it never was there
-                folder.rmdir()
+            removal.discard_empty(folder)
 
     def _renewed(self) -> int | None:
         try:
