@@ -39,7 +39,8 @@ def viser_or_why() -> ModuleType:
     try:
         import viser
     except ImportError as error:
-        raise BadInput("--live needs viser, which is not installed: pip install 'ihbench[view]'") from error
+        why = "is not installed" if error.name == "viser" else f"cannot be imported ({error})"
+        raise BadInput(f"--live needs viser, which {why}: pip install 'ihbench[view]'") from error
     return viser
 
 
