@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from ihbench.body import Body
-from ihbench.clock.events import Warned
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
+from ihbench.fit.mean_betas import mean_betas
 from ihbench.methods.humannerf.avatar import HumanNerfAvatar
 from ihbench.methods.humannerf.config import HumanNerfConfig
 from ihbench.methods.humannerf.fitting import HumanNerfFit
 from ihbench.scene.contracts import TrainingSet
-
-SAME_BETAS = 1e-3  # a shape coefficient that varies less over the frames is the same
 
 
 class HumanNerfMethod:
@@ -33,10 +29,8 @@ class HumanNerfMethod:
         if not len(training.views):
             raise BadInput(f"scene {training.name}: no training view; nothing to fit")
         with ledger.stage("fit/prepare"):
-            betas = np.array([view.body_pose.betas for view in training.views])
-            if np.ptp(betas, axis=0).max(initial=0) > SAME_BETAS:
-                ledger.event_once(Warned("shape coefficients vary over the frames; the T-pose has their mean"))
-            avatar = HumanNerfAvatar(self.config, training.body, betas.mean(0), seed).to(device)
+            betas = mean_betas(training.views, ledger, "the T-pose")
+            avatar = HumanNerfAvatar(self.config, training.body, betas, seed).to(device)
             fit = HumanNerfFit(avatar, training, seed, ledger)
         with ledger.stage("fit/field"):
             fit.run(progress)
