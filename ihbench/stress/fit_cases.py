@@ -87,6 +87,51 @@ class FitCases:
     def helps(self, name: str, what: str, function: Callable[[], Answer]) -> Case:
         return self.case(name, what, function, "at most", HELPS)
 
+    def other_shapes(self) -> Case:
+        """Shape coefficients that differ by frame: one avatar, with their mean."""
+
+        def ratio() -> Answer:
+            shown = [
+                replace(view, body_pose=replace(view.body_pose, betas=np.array([0.5 * (-1) ** k, 0.0])))
+                for k, view in enumerate(views())
+            ]
+            return self.ratio(self.tiny, training_set(shown))
+
+        return self.helps("other-shapes", "shape coefficients that differ by frame", ratio)
+
+    def ignoring(self) -> list[Case]:
+        """Of a method that takes hidden pixels for background unless it is told to ignore them: when it is."""
+        config, how = replace(self.tiny, unknown="ignore"), "hidden pixels are ignored"
+        empty, bad = f"two frames without a visible pixel, {how}", f"NaN behind the occluder, {how}"
+        return [
+            self.helps("empty-mask-ignored", empty, lambda: self.empty_masks(config)),
+            self.helps("nan-hidden-ignored", bad, lambda: self.ratio(config, with_bad_hidden_pixels(1, math.nan))),
+        ]
+
+    def resumed(
+        self,
+        stage: Callable[[Any, TrainingSet, Ledger], Any],  # the fit of a fresh avatar
+        fresh: Callable[[Config, TrainingSet], Any] | None = None,  # else `start`
+        config: Config | None = None,  # else `tiny`
+    ) -> Case:
+        """Killed and gone on with: the same bits as without."""
+
+        def changed() -> Answer:
+            from ihbench.stress.resuming import changed_by_a_kill
+
+            training, own = training_set(), config or self.tiny
+            whole, _ = self.story(own, training)
+            assert whole is not None
+            begin = fresh or self.start
+            return Answer(
+                changed_by_a_kill(
+                    lambda: begin(own, training), lambda avatar, ledger: stage(avatar, training, ledger), whole
+                ),
+                0,
+            )
+
+        return self.case("resumed", "killed and gone on with", changed, "absolute", "what continues is the same fit")
+
     def usual(
         self, normal: Config, unseen: Config, pruned: Config | None, factors: Sequence[float] = (100.0, 1e4, 1e30)
     ) -> list[Case]:

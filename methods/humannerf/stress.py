@@ -3,7 +3,6 @@ shapes that differ by frame, fits that stay empty, and a kill. Named in the spec
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -16,8 +15,7 @@ from ihbench.methods.humannerf.method import HumanNerfMethod
 from ihbench.scene.contracts import TrainingSet
 from ihbench.stress.case import Answer
 from ihbench.stress.fit_cases import STEP, FitCases
-from ihbench.stress.resuming import changed_by_a_kill
-from ihbench.stress.six_views import training_set, views, with_bad_hidden_pixels
+from ihbench.stress.six_views import training_set, views
 
 # whole pictures, so that a bad pixel is met; every part is on before the end
 TINY = replace(
@@ -47,15 +45,6 @@ def start(config: HumanNerfConfig, training: TrainingSet) -> Any:
     return HumanNerfAvatar(config, training.body, training.views[0].body_pose.betas, 0)
 
 
-def _other_shapes() -> Answer:
-    """Shape coefficients that differ by frame: one T-pose, with their mean."""
-    shown = [
-        replace(view, body_pose=replace(view.body_pose, betas=np.array([0.5 * (-1) ** k, 0.0])))
-        for k, view in enumerate(views())
-    ]
-    return OURS.ratio(TINY, training_set(shown))
-
-
 def _empty() -> Answer:
     """Nobody is on the person's pixels and nobody may be: the fit starts again, and ends as a divergence."""
     config = replace(TINY, on_person=0.0, lr=0.3, guard=(6,))
@@ -64,28 +53,18 @@ def _empty() -> Answer:
     return Answer(OURS.story(config, training_set(shown))[1], "new starts")
 
 
-def _resumed() -> Answer:
-    """Killed with all parts on, and gone on with: the same bits as without."""
+def stage(avatar: Any, training: TrainingSet, ledger: Ledger) -> Any:
+    """The fit of an avatar that has begun."""
     from ihbench.methods.humannerf.fitting import HumanNerfFit
 
-    training = training_set()
-    whole, _ = OURS.story(TINY, training)
-    assert whole is not None
-    changed = changed_by_a_kill(
-        lambda: start(TINY, training), lambda avatar, ledger: HumanNerfFit(avatar, training, 0, ledger), whole
-    )
-    return Answer(changed, 0)
+    return HumanNerfFit(avatar, training, 0, ledger)
 
 
 OURS = FitCases("humannerf", TINY, RATES, fit, start)
-IGNORING = replace(TINY, unknown="ignore")
 CASES = [
     *OURS.usual(TINY, TINY, None),
-    OURS.helps("empty-mask-ignored", "two frames without a visible pixel, hidden pixels are ignored",
-               lambda: OURS.empty_masks(IGNORING)),
-    OURS.helps("nan-hidden-ignored", "NaN behind the occluder, hidden pixels are ignored",
-               lambda: OURS.ratio(IGNORING, with_bad_hidden_pixels(1, math.nan))),
-    OURS.helps("other-shapes", "shape coefficients that differ by frame", _other_shapes),
+    *OURS.ignoring(),
+    OURS.other_shapes(),
     OURS.case("empty", "everything is background", _empty, "words", STEP),
-    OURS.case("resumed", "killed and gone on with", _resumed, "absolute", "what continues is the same fit"),
+    OURS.resumed(stage),
 ]  # fmt: skip

@@ -3,7 +3,6 @@ a person in one pixel, shapes that differ by frame, an infinite prior, and a kil
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -16,8 +15,7 @@ from ihbench.methods.occnerf.method import OccNerf
 from ihbench.scene.contracts import MaskState, TrainingSet
 from ihbench.stress.case import Answer
 from ihbench.stress.fit_cases import STEP, FitCases
-from ihbench.stress.resuming import changed_by_a_kill
-from ihbench.stress.six_views import only_a_pixel, training_set, views, with_bad_hidden_pixels
+from ihbench.stress.six_views import only_a_pixel, training_set, views
 
 TINY = replace(SMOKE, steps=18, decay_steps=18, samples=32, inside=0, levels=3, hash_size=8, hash_finest=32)
 RATES = ("lr", "lr_grid", "lr_displacement", "lr_motion")
@@ -45,15 +43,6 @@ def _one_pixel() -> Answer:
     return Answer(f"finite {bool(np.isfinite(rgb).all() and np.isfinite(alpha).all())}: {what}", "finite True")
 
 
-def _other_shapes() -> Answer:
-    """Shape coefficients that differ by frame: one T-pose, with their mean."""
-    shown = [
-        replace(view, body_pose=replace(view.body_pose, betas=np.array([0.5 * (-1) ** k, 0.0])))
-        for k, view in enumerate(views())
-    ]
-    return OURS.ratio(TINY, training_set(shown))
-
-
 def _huge_prior() -> Answer:
     """A completeness prior a million times as heavy: gradients are clipped, alpha is still finite."""
     avatar, what = OURS.story(replace(TINY, completeness_weight=1e6))
@@ -63,32 +52,21 @@ def _huge_prior() -> Answer:
     return Answer(f"finite {bool(np.isfinite(alpha).all())}: {what}", "finite True")
 
 
-def _resumed() -> Answer:
-    """Killed with counters, displacements and both passes on, and gone on with: the same bits as without."""
+def stage(avatar: Any, training: TrainingSet, ledger: Ledger) -> Any:
+    """The fit of an avatar that has begun."""
     from ihbench.methods.occnerf.fitting import OccNerfFit
 
-    training = training_set()
-    config = replace(TINY, inside=8)
-    whole, _ = OURS.story(config, training)
-    assert whole is not None
-    changed = changed_by_a_kill(
-        lambda: start(config, training), lambda avatar, ledger: OccNerfFit(avatar, training, 0, ledger), whole
-    )
-    return Answer(changed, 0)
+    return OccNerfFit(avatar, training, 0, ledger)
 
 
 OURS = FitCases("occnerf", TINY, RATES, fit, start)
-IGNORING = replace(TINY, unknown="ignore")
 CASES = [
     *OURS.usual(TINY, TINY, None),
-    OURS.helps("empty-mask-ignored", "two frames without a visible pixel, hidden pixels are ignored",
-               lambda: OURS.empty_masks(IGNORING)),
-    OURS.helps("nan-hidden-ignored", "NaN behind the occluder, hidden pixels are ignored",
-               lambda: OURS.ratio(IGNORING, with_bad_hidden_pixels(1, math.nan))),
+    *OURS.ignoring(),
     OURS.helps("released-prior", "the completeness prior as released",
                lambda: OURS.ratio(replace(TINY, completeness="released"))),
-    OURS.helps("other-shapes", "shape coefficients that differ by frame", _other_shapes),
+    OURS.other_shapes(),
     OURS.case("one-pixel", "one person pixel a view", _one_pixel, "words", STEP),
     OURS.case("huge-prior", "a completeness prior a million times as heavy", _huge_prior, "words", STEP),
-    OURS.case("resumed", "killed and gone on with", _resumed, "absolute", "what continues is the same fit"),
+    OURS.resumed(stage, config=replace(TINY, inside=8)),
 ]  # fmt: skip

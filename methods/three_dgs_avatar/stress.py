@@ -3,11 +3,8 @@ pixels, a single Gaussian, shapes that differ by frame, and a kill. Named in the
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
-
-import numpy as np
 
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
@@ -16,8 +13,6 @@ from ihbench.methods.three_dgs_avatar.method import ThreeDgsAvatarMethod
 from ihbench.scene.contracts import TrainingSet
 from ihbench.stress.case import Answer
 from ihbench.stress.fit_cases import STEP, FitCases
-from ihbench.stress.resuming import changed_by_a_kill
-from ihbench.stress.six_views import training_set, views, with_bad_hidden_pixels
 
 # all of the schedule in 18 steps, but for a reset, which so few do not outlive
 TINY = replace(
@@ -59,37 +54,18 @@ def _one_gaussian() -> Answer:
     return Answer(f"{0 if avatar is None else len(avatar)} left: {what}", "no step rejected")
 
 
-def _other_shapes() -> Answer:
-    """Shape coefficients that differ by frame: one avatar, with their mean."""
-    shown = [
-        replace(view, body_pose=replace(view.body_pose, betas=np.array([0.5 * (-1) ** k, 0.0])))
-        for k, view in enumerate(views())
-    ]
-    return OURS.ratio(TINY, training_set(shown))
-
-
-def _resumed() -> Answer:
-    """Killed after a change of the set and with all parts on, and gone on with: the same bits as without."""
+def stage(avatar: Any, training: TrainingSet, ledger: Ledger) -> Any:
+    """The fit of an avatar that has begun."""
     from ihbench.methods.three_dgs_avatar.fitting import ThreeDgsAvatarFit
 
-    training = training_set()
-    whole, _ = OURS.story(TINY, training)
-    assert whole is not None
-    changed = changed_by_a_kill(
-        lambda: start(TINY, training), lambda avatar, ledger: ThreeDgsAvatarFit(avatar, training, 0, ledger), whole
-    )
-    return Answer(changed, 0)
+    return ThreeDgsAvatarFit(avatar, training, 0, ledger)
 
 
 OURS = FitCases("three-dgs-avatar", TINY, RATES, fit, start)
-IGNORING = replace(TINY, unknown="ignore")
 CASES = [
     *OURS.usual(TINY, TINY, replace(TINY, density=replace(TINY.density, faint=1.0))),
-    OURS.helps("empty-mask-ignored", "two frames without a visible pixel, hidden pixels are ignored",
-               lambda: OURS.empty_masks(IGNORING)),
-    OURS.helps("nan-hidden-ignored", "NaN behind the occluder, hidden pixels are ignored",
-               lambda: OURS.ratio(IGNORING, with_bad_hidden_pixels(1, math.nan))),
-    OURS.helps("other-shapes", "shape coefficients that differ by frame", _other_shapes),
+    *OURS.ignoring(),
+    OURS.other_shapes(),
     OURS.case("one-gaussian", "a single Gaussian", _one_gaussian, "words", STEP),
-    OURS.case("resumed", "killed and gone on with", _resumed, "absolute", "what continues is the same fit"),
+    OURS.resumed(stage),
 ]  # fmt: skip

@@ -15,7 +15,6 @@ from ihbench.methods.wild2avatar.method import Wild2Avatar
 from ihbench.scene.contracts import TrainingSet
 from ihbench.stress.case import Answer
 from ihbench.stress.fit_cases import FitCases
-from ihbench.stress.resuming import changed_by_a_kill
 from ihbench.stress.six_views import training_set, views
 
 # every part in 18 steps, three looks at the surface among them
@@ -60,15 +59,6 @@ def begun(config: Wild2AvatarConfig, training: TrainingSet) -> Any:
     return avatar
 
 
-def _other_shapes() -> Answer:
-    """Shape coefficients that differ by frame: one avatar, with their mean."""
-    shown = [
-        replace(view, body_pose=replace(view.body_pose, betas=np.array([0.5 * (-1) ** k, 0.0])))
-        for k, view in enumerate(views())
-    ]
-    return OURS.ratio(TINY, training_set(shown))
-
-
 def _vanished() -> Answer:
     """A distance field that is positive everywhere: nothing is drawn, and no gradient is NaN."""
     import torch
@@ -85,23 +75,17 @@ def _vanished() -> Answer:
     return Answer(f"finite {finite}, alpha {alpha.max():.0f}", "finite True, alpha 0")
 
 
-def _resumed() -> Answer:
-    """Killed between two looks at the surface, and gone on with: the same bits as without."""
+def stage(avatar: Any, training: TrainingSet, ledger: Ledger) -> Any:
+    """The fit of an avatar that has begun."""
     from ihbench.methods.wild2avatar.fitting import Wild2AvatarFit
 
-    training = training_set()
-    whole, _ = OURS.story(TINY, training)
-    assert whole is not None
-    changed = changed_by_a_kill(
-        lambda: start(TINY, training), lambda avatar, ledger: Wild2AvatarFit(avatar, training, 0, ledger), whole
-    )
-    return Answer(changed, 0)
+    return Wild2AvatarFit(avatar, training, 0, ledger)
 
 
 OURS = FitCases("wild2avatar", TINY, RATES, fit, begun)
 CASES = [
     *OURS.usual(TINY, replace(TINY, steps=45), None),
-    OURS.helps("other-shapes", "shape coefficients that differ by frame", _other_shapes),
+    OURS.other_shapes(),
     OURS.case("vanished", "a surface that is nowhere", _vanished, "words", "an empty picture is a picture"),
-    OURS.case("resumed", "killed and gone on with", _resumed, "absolute", "what continues is the same fit"),
+    OURS.resumed(stage, fresh=start),
 ]
