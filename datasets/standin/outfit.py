@@ -535,7 +535,7 @@ def _neighbour_mean(faces: NDArray[np.integer], n: int) -> csr_array:
     return csr_array(diags_array(1 / degree) @ adjacent)
 
 
-def bake(body: Body, style: Style, size: int = TEXTURE_SIZE) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+def bake(body: Body, style: Style, size: int) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Texture [S, S, 3] sRGB in [0, 1] and part labels [S, S] over the body's atlas; row 0 is v = 1.
 
     Texels outside every chart take the nearest chart's value, so bilinear look-ups at a seam do not bleed.

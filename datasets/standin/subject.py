@@ -96,7 +96,7 @@ class Subject:
     @cached_property
     def baked(self) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         """Over the body's atlas [S, S, 3] sRGB albedo in [0, 1], and [S, S] `outfit.Part`."""
-        return outfit.bake(self.body, self.style)
+        return outfit.bake(self.body, self.style, outfit.TEXTURE_SIZE)
 
     def vertices(self, frame: int) -> NDArray[np.float64]:
         """[V, 3] m, world: the unclothed body."""

@@ -17,17 +17,26 @@ from ihbench.cli import main
 from ihbench.datasets.layouts import OCMOTION, PEOPLE_SNAPSHOT
 from ihbench.datasets.people_snapshot import original as people_snapshot
 from ihbench.datasets.reading.pickles import write_pickle
-from ihbench.datasets.standin import ocmotion_capture, people_snapshot_capture
+from ihbench.datasets.standin import ocmotion_capture, outfit, people_snapshot_capture
 from ihbench.datasets.standin.ocmotion_capture import OcMotionStandIn
 from ihbench.datasets.standin.people_snapshot_capture import PeopleSnapshotStandIn
 from ihbench.errors import BadInput
 from ihbench.metrics import psnr
 
 FRAMES = 6
+TEXTURE = 128  # px
+
+
+@pytest.fixture(autouse=True, scope="module")
+def small_texture():
+    """A texture of the outfit takes two seconds at its own size, and nothing here looks at it closely."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(outfit, "TEXTURE_SIZE", TEXTURE)
+        yield
 
 
 @pytest.fixture(scope="module")
-def snapshot(tmp_path_factory):
+def snapshot(small_texture, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(people_snapshot_capture, "N_FRAMES", FRAMES)
         patch.setattr(people_snapshot_capture, "SIZE", 180)
@@ -35,7 +44,7 @@ def snapshot(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def ocmotion(tmp_path_factory):
+def ocmotion(small_texture, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ocmotion_capture, "N_FRAMES", FRAMES)
         patch.setattr(ocmotion_capture, "WIDTH", 240)
@@ -291,9 +300,10 @@ MAKERS = {
 PRELUDE = """
 import sys, time
 from pathlib import Path
-from ihbench.datasets.standin import {module}
+from ihbench.datasets.standin import {module}, outfit
 from ihbench.errors import BadInput
 from ihbench.clock.progress import Progress
+outfit.TEXTURE_SIZE = {texture}
 root, seed, gate = Path(sys.argv[1]), int(sys.argv[2]), Path(sys.argv[3])
 (gate / str(time.monotonic_ns())).touch()
 while len(list(gate.iterdir())) < int(sys.argv[4]):
@@ -307,7 +317,7 @@ except BadInput as error:
 
 
 def _start(call, module, root, gate, seeds, together):
-    code = PRELUDE.format(module=module, call=call.replace("\n", "\n    "))
+    code = PRELUDE.format(texture=TEXTURE, module=module, call=call.replace("\n", "\n    "))
     return [
         subprocess.Popen(
             [sys.executable, "-c", code, str(root), str(seed), str(gate), str(together)],
@@ -371,7 +381,9 @@ def test_a_full_disk_leaves_what_can_be_completed(name, tmp_path):
     assert first.replace("gate", "root") != call
     calls = f"{first}\n{limit}{call}"
     (tmp_path / "gate").mkdir()
-    code = PRELUDE.replace("(gate /", "(gate.parent /").format(module=module, call=calls.replace("\n", "\n    "))
+    code = PRELUDE.replace("(gate /", "(gate.parent /").format(
+        texture=TEXTURE, module=module, call=calls.replace("\n", "\n    ")
+    )
     words = [str(tmp_path / "root"), "0", str(tmp_path / "gate"), "0"]
     full = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True)
     assert full.returncode == 2, full.stderr
