@@ -46,7 +46,7 @@ class States:
         if self.folder is None:
             self._in_memory[name] = _copies(tensors), encoded
         else:
-            write_bytes(file, _pack(tensors, {**encoded, "name": name, "of": self.folder.name}))
+            write_bytes(file, *_pack(tensors, {**encoded, "name": name, "of": self.folder.name}))
 
     def load(self, name: str) -> tuple[Tensors, Words] | None:
         """Tensors (as they were: torch on the CPU, or numpy) and words of state `name`, or None if there is none.
@@ -80,20 +80,29 @@ def is_saved_state(file: Path) -> bool:
 
 def _copies(tensors: Mapping[str, Any]) -> Tensors:
     """Own, contiguous copies on the CPU: what is written later cannot change, and no two share memory."""
+    return {
+        name: np.array(value, order="C") if isinstance(value, np.ndarray) else value.clone()
+        for name, value in _plain(tensors).items()
+    }
+
+
+def _plain(tensors: Mapping[str, Any]) -> Tensors:
+    """The same on the CPU, contiguous; not copied where they are so already. `TypeError` for anything else."""
     out: Tensors = {}
     for name, value in tensors.items():
         if hasattr(value, "detach"):
-            out[name] = value.detach().to("cpu", copy=True).contiguous()
+            out[name] = value.detach().cpu().contiguous()
         elif isinstance(value, np.ndarray):
-            out[name] = np.array(value, order="C")
+            out[name] = np.ascontiguousarray(value).reshape(value.shape)  # numpy makes a vector of a single number
         else:
             raise TypeError(f"checkpoint {name}: expected a tensor or an array, got {type(value).__name__}")
     return out
 
 
-def _pack(tensors: Mapping[str, Any], record: Mapping[str, Any]) -> bytes:
-    """A safetensors file with the record and a checksum of the payload in its metadata."""
-    values = _copies(tensors)
+def _pack(tensors: Mapping[str, Any], record: Mapping[str, Any]) -> tuple[bytes, memoryview]:
+    """A safetensors file with the record and a checksum of the payload in its metadata: its header and its payload,
+    which can be hundreds of megabytes."""
+    values = _plain(tensors)
     arrays = [name for name, value in values.items() if isinstance(value, np.ndarray)]
     metadata = {"record": json.dumps({**record, "arrays": arrays}), "payload_crc32": "00000000"}
     if len(arrays) == len(values):
@@ -101,13 +110,25 @@ def _pack(tensors: Mapping[str, Any], record: Mapping[str, Any]) -> bytes:
 
         data = save(values, metadata)
     else:
-        import torch
-        from safetensors.torch import save as save_torch
+        data = _saved_with_torch(values, metadata)
+    header, payload = data[: _payload_start(data)], memoryview(data)[_payload_start(data) :]
+    crc = b"%08x" % zlib.crc32(payload)
+    return header.replace(CRC_BLANK, CRC_BLANK.replace(b"00000000", crc), 1), payload
 
-        named = {name: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for name, v in values.items()}
-        data = save_torch(named, metadata)
-    crc = zlib.crc32(memoryview(data)[_payload_start(data) :])
-    return data.replace(CRC_BLANK, CRC_BLANK.replace(b"00000000", b"%08x" % crc), 1)
+
+def _saved_with_torch(values: Tensors, metadata: dict[str, str]) -> bytes:
+    """The file's bytes. A view, and a tensor whose memory another one has, are copied: safetensors refuses them."""
+    import torch
+    from safetensors.torch import save
+
+    named, seen = {}, set()
+    for name, value in values.items():
+        tensor = torch.from_numpy(value) if isinstance(value, np.ndarray) else value
+        memory = tensor.untyped_storage()
+        own = memory.nbytes() == tensor.nbytes and memory.data_ptr() not in seen
+        seen.add(memory.data_ptr())
+        named[name] = tensor if own else tensor.clone()
+    return save(named, metadata)
 
 
 def _unpack(data: bytes) -> tuple[Tensors, Words]:

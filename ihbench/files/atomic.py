@@ -55,8 +55,8 @@ USER_ERRORS = {
 }
 
 
-def write_bytes(path: Path, data: bytes, durable: bool = True) -> None:
-    """Write the file whole, or leave what was there. Missing parent folders are made.
+def write_bytes(path: Path, *data: bytes | memoryview, durable: bool = True) -> None:
+    """Write the file, pieces in turn, whole, or leave what was there. Missing parent folders are made.
 
     See `replaced`. What is no regular file (a terminal, a pipe, /dev/null, /dev/stdout) is written into instead.
     Raises `BadInput` when the disk is full or may not be written.
@@ -66,12 +66,12 @@ def write_bytes(path: Path, data: bytes, durable: bool = True) -> None:
         stream = _stream(path)
         if stream is not None:
             with suppress(BrokenPipeError), stream:  # who reads no further has had enough
-                stream.write(data)
+                stream.writelines(data)
             return
     except OSError as error:
         raise _explained(error, path) from error
-    with replaced(path, durable) as temporary:
-        temporary.write_bytes(data)
+    with replaced(path, durable) as temporary, open(temporary, "wb") as file:
+        file.writelines(data)
 
 
 @contextmanager

@@ -58,7 +58,7 @@ def write_npz(
     """Write the arrays by name, the file whole or not at all (`atomic.write_bytes`)."""
     buffer = io.BytesIO()
     (np.savez_compressed if compressed else np.savez)(buffer, **arrays)  # pyright: ignore[reportArgumentType]
-    atomic.write_bytes(Path(path), buffer.getvalue(), durable)
+    atomic.write_bytes(Path(path), buffer.getvalue(), durable=durable)
 
 
 def _array(member: IO[bytes], where: str, largest: int) -> NDArray:

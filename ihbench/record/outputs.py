@@ -36,7 +36,7 @@ def write_bytes(path: Path, data: bytes, durable: bool = True) -> None:
         written = _written(path.parent)
         # first the list, with the old file and the new: a kill in between must not make a stranger of either
         _note(path, [*written.get(path.name, []), digest], written)
-        atomic.write_bytes(path, data, durable)
+        atomic.write_bytes(path, data, durable=durable)
         _note(path, [digest], written)
 
 
