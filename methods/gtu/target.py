@@ -10,10 +10,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ihbench.body import Body
 from ihbench.camera import Camera
 from ihbench.fit.losses import Perceptual, dissimilarity
 from ihbench.methods.gtu.avatar import GtuAvatar
 from ihbench.methods.gtu.config import GtuConfig
+from ihbench.render.zbuffer import rasterize
 from ihbench.scene.contracts import MaskState, TrainView
 
 # keeps R(0) and R(1) at 0: ln(1 + 1/e)
@@ -39,8 +41,7 @@ def prepare_target(avatar: GtuAvatar, view: TrainView) -> Target:
     config, camera = avatar.config, view.camera
     rows, columns = person_box(camera, avatar.body.pose(view.body_pose), config.box)
     joints = avatar.deformation.joints(view.body_pose.betas)
-    occluder = (view.mask == MaskState.UNKNOWN) & (config.unknown == "ignore")
-    keep = ~grown(occluder, round(config.dilation * (camera.width + camera.height)))
+    keep = ~left_out(view, avatar.body, config)
 
     def pixels(chosen: NDArray[np.bool_]) -> Tensor:
         return torch.from_numpy(chosen[rows, columns, None].astype(np.float32)).to(avatar.device)
@@ -58,6 +59,21 @@ def prepare_target(avatar: GtuAvatar, view: TrainView) -> Target:
         person=pixels(person),
         keep=pixels(keep),
     )
+
+
+def left_out(view: TrainView, body: Body, config: GtuConfig) -> NDArray[np.bool_]:
+    """[H, W] pixels that are in no loss: the occluder, and what is near to where it hides the body.
+
+    Only there is it grown. Beside an occluder that stands in the scene the mask leaves a ring about the whole body
+    unknown, which may be clothes; grown, it would take the visible limbs.
+    """
+    occluder = view.mask == MaskState.UNKNOWN
+    if config.unknown != "ignore" or not occluder.any():
+        return np.zeros_like(occluder)
+    camera = view.camera
+    points = camera.project(body.pose(view.body_pose))
+    behind = rasterize(points, body.faces, camera.height, camera.width).mask & occluder
+    return occluder | grown(behind, round(config.dilation * (camera.width + camera.height)))
 
 
 def person_box(

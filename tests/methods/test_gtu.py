@@ -21,7 +21,8 @@ from ihbench.methods.gtu.method import Gtu
 from ihbench.methods.gtu.prompts import azimuth_of, caption, prompts_of, side_of
 from ihbench.methods.gtu.random_views import EARLY, KINDS, LATE, camera_at, drawn, view_from
 from ihbench.methods.gtu.schedule import noise_range, photo_weight, sds_step
-from ihbench.methods.gtu.target import grown, person_box, prepare_target, reconstruction_loss, undecided
+from ihbench.methods.gtu.target import grown, left_out, person_box, prepare_target, reconstruction_loss, undecided
+from ihbench.render.zbuffer import rasterize
 from ihbench.scene.contracts import MaskState
 from ihbench.scene.method_spec import method_spec
 from tests.bench.fake_capture import a_camera, a_pose, the_body, train_view
@@ -201,12 +202,27 @@ def loss_and_gradients(view, unknown):
 @pytest.mark.parametrize("unknown", ["ignore", "background"])
 def test_check_8_nothing_under_the_grown_occluder_counts(unknown):
     view = training_views()[1]
-    near = grown(view.mask == MaskState.UNKNOWN, round(PAPER.dilation * 128))
+    near = left_out(view, BODY, PAPER)
     assert (near & (view.mask == MaskState.PERSON)).sum() > 20
     painted = replace(view, image=np.where(near[..., None], 255 - view.image, view.image))
     (loss, gradients), (other, others) = (loss_and_gradients(each, unknown) for each in (view, painted))
     same = loss == other and all(torch.equal(a, b) for a, b in zip(gradients, others, strict=True))
     assert same == (unknown == "ignore")
+
+
+def test_an_occluder_grows_where_it_hides_the_body_and_a_ring_about_the_body_does_not():
+    """Restated: within 4 px in both axes of body pixels that are unknown, and what is unknown itself."""
+    view = training_views()[1]
+    points = view.camera.project(BODY.pose(view.body_pose))
+    body = rasterize(points, BODY.faces, view.camera.height, view.camera.width).mask
+    ring = grown(body, 9) & ~body
+    ringed = replace(view, mask=np.where(ring, MaskState.UNKNOWN, view.mask))
+    unknown = ringed.mask == MaskState.UNKNOWN
+    expected = unknown | grown(unknown & body, round(PAPER.dilation * 128))
+    assert (left_out(ringed, BODY, PAPER) == expected).all()
+    person = ringed.mask == MaskState.PERSON
+    assert (person & ~left_out(ringed, BODY, PAPER)).sum() > 3 * (person & ~grown(unknown, 4)).sum()
+    assert not left_out(view, BODY, replace(PAPER, unknown="background")).any()
 
 
 def test_without_occluder_masks_a_hidden_pixel_is_background():
@@ -226,7 +242,7 @@ def test_the_loss_is_the_mean_over_the_whole_box():
     shape = rows.stop - rows.start, columns.stop - columns.start
     own = torch.rand(*shape, 3, generator=torch.Generator().manual_seed(0))
     person = (view.mask == MaskState.PERSON)[rows, columns, None]
-    keep = ~grown(view.mask == MaskState.UNKNOWN, 4)[rows, columns, None]
+    keep = ~left_out(view, BODY, PAPER)[rows, columns, None]
     image = np.where(person, view.image[rows, columns] / 255, backdrop.numpy())
     expected = np.abs((own.numpy() - image) * keep).mean()
     assert reconstruction_loss(own, target, backdrop, avatar.config).item() == pytest.approx(expected, rel=1e-5)

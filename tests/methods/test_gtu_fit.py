@@ -15,7 +15,7 @@ from ihbench.methods.gtu.fitting import pruning_alone
 from ihbench.methods.gtu.identity import CROSS_ATTENTION, IdentityTuning
 from ihbench.methods.gtu.method import Gtu
 from ihbench.methods.gtu.random_views import view_from
-from ihbench.methods.gtu.target import grown
+from ihbench.methods.gtu.target import left_out
 from ihbench.render.zbuffer import vertex_normals
 from ihbench.scene.contracts import MaskState
 from tests.bench.fake_capture import a_camera, a_pose, the_body, train_view
@@ -80,7 +80,7 @@ def test_check_8_every_vertex_is_there_at_the_end(whole):
 
 def test_check_8_a_picture_behind_the_occluder_changes_no_bit():
     def painted(view):
-        near = grown(view.mask == MaskState.UNKNOWN, round(TINY.dilation * 2 * SIZE))
+        near = left_out(view, BODY, TINY)
         return replace(view, image=np.where(near[..., None], 255 - view.image, view.image))
 
     views = training_views()
