@@ -12,14 +12,19 @@ from torch import Tensor
 from torch.autograd import Function
 
 SHARPNESS = 100.0  # β
+FLAT, LEAST = -0.25, 1e-10  # farther left it is constant; slopes below are 0, see `_Softplus`
 
 
 class _Softplus(Function):
+    """Without its tail: e^{β x} of an x below -.9 is a subnormal number. Those, multiplied on through a network and
+    back, took half of a step's time on a CPU."""
+
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
-        slope = torch.sigmoid(SHARPNESS * x)
+        near = x.clamp(min=FLAT)
+        slope = F.threshold(torch.sigmoid(SHARPNESS * near), LEAST, 0.0)
         ctx.save_for_backward(x, slope)
-        return F.softplus(x, beta=SHARPNESS)
+        return F.softplus(near, beta=SHARPNESS)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Tensor:

@@ -17,6 +17,7 @@ from ihbench.methods.wild2avatar.person.sdf_network import SdfNetwork
 
 RATE, LAST_SHARE = 5e-3, 0.02  # of Adam, and what is left of it at the end
 POINTS = 512  # of each kind in a step
+POOL = 32_768  # places off the surface whose distances are looked up once, and drawn from in every step
 NEAR, AROUND = 0.05, 0.3  # m, standard deviations of places from the surface
 FARTHEST = 0.3  # m: beyond, distances count less
 KEPT = 4  # fitted networks
@@ -43,18 +44,19 @@ def fit_to_body(network: SdfNetwork, body: CanonicalBody, seed: int, steps: int)
 def _fit(network: SdfNetwork, body: CanonicalBody, seed: int, steps: int) -> None:
     rng = np.random.default_rng((seed, 0))
     surface = BodySurface(body, rng)
+    pool = min(POOL, steps * POINTS)
+    spread = np.where(np.arange(pool) % 3 > 0, NEAR, AROUND)[:, None]
+    places = surface.points[rng.integers(len(surface.points), size=pool)] + spread * rng.standard_normal((pool, 3))
+    away = surface.distance(places)
     optimizer = torch.optim.Adam(network.parameters(), lr=RATE, fused=True)
     device = body.vertices.device
     for step in range(steps):
         optimizer.param_groups[0]["lr"] = RATE * LAST_SHARE ** (step / max(steps, 1))
-        of = rng.integers(len(surface.points), size=(2, POINTS))
-        on = surface.points[of[0]]
-        spread = np.where(np.arange(POINTS) % 3 > 0, NEAR, AROUND)[:, None]
-        off = surface.points[of[1]] + spread * rng.standard_normal((POINTS, 3))
+        of, off = rng.integers(len(surface.points), size=POINTS), rng.integers(pool, size=POINTS)
         with torch.enable_grad():
-            wanted = torch.from_numpy(np.concatenate([np.zeros(POINTS), surface.distance(off)])).float().to(device)
-            points = torch.from_numpy(np.concatenate([on, off])).float().to(device)
-            normals = torch.from_numpy(surface.normals[of[0]]).float().to(device)
+            wanted = torch.from_numpy(np.concatenate([np.zeros(POINTS), away[off]])).float().to(device)
+            points = torch.from_numpy(np.concatenate([surface.points[of], places[off]])).float().to(device)
+            normals = torch.from_numpy(surface.normals[of]).float().to(device)
             optimizer.zero_grad()
             loss(network, points, wanted, normals).backward()
             optimizer.step()
