@@ -97,6 +97,8 @@ class Wild2AvatarConfig:
     background_alpha: Annotated[float, WEIGHT] = 0.1
     """Weight of -log(1 - alpha) of the person on known background [inferred: without it the distance field takes up a
     plain background; Vid2Avatar's issue 45]."""
+    around: Annotated[float, WEIGHT] = 0.005
+    """Weight of the person's alpha on unknown pixels beside the posed body [inferred]."""
     occlusion_loss: Annotated[float, WEIGHT] = 1.0
     """Weight of L_occ: -log(1 - A) of the layer on visible person, -log A where the body is hidden [inferred]."""
     sparsity: Annotated[float, WEIGHT] = 0.01

@@ -40,7 +40,10 @@ def binary_entropy(alpha: Tensor) -> Tensor:
 def ray_losses(rays: Rays, target: Target, config: Wild2AvatarConfig, epoch: float) -> dict[str, Tensor]:
     """The weighted terms by name. `epoch` counts to `FULL`; see `config.ramp_epochs`."""
     at, alpha = rays.pixels, rays.human
-    person, unknown, body = target.person[at], target.unknown[at], target.body[at]
+    person, unknown, body, empty = target.person[at], target.unknown[at], target.body[at], target.background[at]
+    if config.interval == "body":
+        # the other rays are empty by rule; counted, they leave nothing of this term at the silhouette's rim
+        empty = empty & (target.near[at] < target.far[at])
     # not by a product alone: what is unknown may be NaN
     known = target.coloured[at]
     wanted = torch.where(known[:, None], target.colours[at], 0.0)
@@ -49,8 +52,9 @@ def ray_losses(rays: Rays, target: Target, config: Wild2AvatarConfig, epoch: flo
         "entropy": config.entropy * binary_entropy(alpha),
         "beside": config.beside * (1 + epoch**2 / 40) * mean_of(alpha, rays.beside),
         "inside": config.inside * max(1 - epoch / FULL, 0) * mean_of(1 - alpha, body),
-        "completeness": config.completeness * mean_of(-(alpha + LEAST).log(), body),
-        "background": config.background_alpha * mean_of(-(1 - alpha + LEAST).log(), target.background[at]),
+        "completeness": config.completeness * mean_of(-(alpha + LEAST).log(), body | person),
+        "background": config.background_alpha * mean_of(-(1 - alpha + LEAST).log(), empty),
+        "around": config.around * mean_of(alpha, unknown & ~body),
     }
     if rays.occlusion is not None:
         layer = rays.occlusion

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, distance_transform_edt
 from torch import Tensor
 
 from ihbench.body import Body
@@ -29,7 +30,7 @@ class Target:
     coloured: Tensor  # [P] bool, where a colour is known
     person: Tensor  # [P] bool, visible
     unknown: Tensor  # [P] bool
-    background: Tensor  # [P] bool, known
+    background: Tensor  # [P] bool, known or `beside_visible`
     body: Tensor  # [P] bool: the posed body covers it
     near: Tensor  # [P] m, see `near_body`
     far: Tensor  # [P] m
@@ -54,6 +55,20 @@ def middle(
     return (vertices.min(0) + vertices.max(0)) / 2
 
 
+def beside_visible(
+    body: NDArray[np.bool_],  # [H, W] the posed body covers it
+    mask: NDArray[np.uint8],  # [H, W] MaskState
+) -> NDArray[np.bool_]:
+    """[H, W] bool: pixels off the body, next to a part of it that is seen. The mask of a real occluder leaves them
+    unknown, since clothes may stand off a body; clothes there would be as visible as what they are on. Without the
+    neighbours of visible person, which show both."""
+    if not body.any():
+        return np.zeros_like(body)
+    person = mask == MaskState.PERSON
+    rows, columns = distance_transform_edt(~body, return_distances=False, return_indices=True)
+    return ~body & ~binary_dilation(person, np.ones((3, 3))) & person[rows, columns]
+
+
 def prepare_target(view: TrainView, row: int, body: Body, filmed: bool, device: torch.device) -> Target:
     """`filmed`: with the colours of occluder and room, where they are known."""
     camera = view.camera
@@ -76,7 +91,7 @@ def prepare_target(view: TrainView, row: int, body: Body, filmed: bool, device: 
         coloured=pixels(coloured),
         person=pixels(view.mask == MaskState.PERSON),
         unknown=pixels(unknown),
-        background=pixels(view.mask == MaskState.BACKGROUND),
+        background=pixels((view.mask == MaskState.BACKGROUND) | (unknown & beside_visible(covered, view.mask))),
         body=pixels(covered),
         near=near,
         far=far,

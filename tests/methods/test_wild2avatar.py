@@ -30,20 +30,22 @@ BODY = the_body()
 BOXED = replace(
     TINY,
     scene="network",
-    steps=300,
+    steps=280,
     rays=64,
     sdf_width=32,
     sdf_depth=3,
-    body_fit=150,
-    beta=0.008,
+    body_fit=400,
+    beta=0.001,
     colour_width=32,
     scene_width=64,
     scene_depth=3,
     scene_frequencies=6,
     scene_samples=6,
     refresh_epochs=10,
+    completeness=0.15,
     lr=0.01,
-    lr_sdf=5e-4,
+    lr_sdf=1e-4,
+    lr_beta=1e-5,
 )
 
 
@@ -76,15 +78,22 @@ def boxed(hidden=True, **changes):
 
 @cache
 def layers(k, hidden=True, **changes):
-    """Each layer of frame k alone: colour and alpha [H, W] of person and occluder, colour of the background."""
+    """Each layer of frame k alone: colour and alpha [H, W] of person and occluder, colour of the background; where
+    a ray comes near the body or meets the box, 0 elsewhere."""
     avatar, training = boxed(hidden, **changes), boxed_set(hidden)
     fit = Wild2AvatarFit(avatar, training, 0, Ledger())
+    target, box = fit._targets[k], torch.from_numpy(shots(hidden)[k].boxed.reshape(-1))
+    pixels = ((target.near < target.far) | box).nonzero()[:, 0]
     with torch.no_grad():
-        human, occlusion, background = fit._layers(k, fit._targets[k], torch.arange(SIZE * SIZE), None)
-    out = {"human": human.alpha, "human_rgb": human.rgb, "background": background.expand(SIZE * SIZE, 3)}
+        human, occlusion, background = fit._layers(k, target, pixels, None)
+    out = {"human": human.alpha, "human_rgb": human.rgb, "background": background.expand(len(pixels), 3)}
     if occlusion is not None:
         out |= {"occluder": occlusion.alpha, "occluder_rgb": occlusion.rgb}
-    return {name: value.numpy().reshape(SIZE, SIZE, *value.shape[1:]) for name, value in out.items()}
+    every = {name: value.new_zeros(SIZE * SIZE, *value.shape[1:]) for name, value in out.items()}
+    return {
+        name: value.index_copy(0, pixels, out[name]).numpy().reshape(SIZE, SIZE, *value.shape[1:])
+        for name, value in every.items()
+    }
 
 
 def overlap(alpha, complete):
@@ -125,7 +134,8 @@ def test_check_5_the_occluders_layer_has_its_colour_where_it_hides_the_person():
 def test_check_5_the_persons_layer_is_complete():
     overlaps = [overlap(layers(k)["human"], shots()[k].complete) for k in BEHIND]
     shown = [overlap(shots()[k].complete & ~shots()[k].boxed, shots()[k].complete) for k in BEHIND]
-    assert np.mean(overlaps) > 0.87 > np.mean(shown)
+    assert np.mean(overlaps) >= 0.95, overlaps
+    assert np.mean(shown) < 0.85
     for k in BEHIND:
         assert layers(k)["human"][shots()[k].boxed & shots()[k].complete].mean() > 0.9
 
@@ -142,44 +152,46 @@ def test_check_5_the_background_shows_no_box():
 
 def test_check_6_without_completeness_the_hidden_body_vanishes():
     """Soon, where the surface learns fast; with the term it stands there, and in the long fit."""
-    fast, means = {"lr_sdf": 2e-3, "steps": 100}, []
+    fast, means = {"lr_sdf": 2e-3, "steps": 80}, []
     for changes in ({}, fast, fast | {"completeness": 0.0}):
-        hidden = [layers(k, **changes)["human"][shots()[k].boxed & shots()[k].complete].mean() for k in BEHIND]
+        hidden = [layers(k, **changes)["human"][shots()[k].boxed & shots()[k].complete].mean() for k in BEHIND[:2]]
         means.append(np.mean(hidden))
-    assert means[0] >= 0.9
-    assert means[1] > 0.8
-    assert means[2] < 0.6
+    assert means[0] >= 0.9, means
+    assert means[1] > 0.8, means
+    assert means[2] < 0.6, means
 
 
 def test_check_6_without_the_occluders_loss_the_person_is_painted_in_its_colour():
     excess = []
-    for changes in ({}, {"occlusion_loss": 0.0, "sparsity": 0.0, "steps": 100}):
+    for changes in ({}, {"occlusion_loss": 0.0, "sparsity": 0.0, "steps": 60}):
         each = []
-        for k in BEHIND:
+        for k in BEHIND[:2]:
             own = layers(k, **changes)
             drawn, hidden = own_colour(own["human_rgb"], own["human"]), shots()[k].boxed & shots()[k].complete
             each.append(red_excess(drawn, without_the_box(k), hidden))
         excess.append(np.mean(each))
-    assert excess[0] < 0.03
-    assert excess[1] > 0.1
+    assert excess[0] < 0.03, excess
+    assert excess[1] > 0.1, excess
 
 
 # --------------------------------------------------------------------------------------- check 7: nothing is hidden
 
 
 def test_check_7_with_nothing_hidden_the_layer_is_empty_and_the_fit_is_that_of_two_parts():
-    some = {"steps": 120}
-    seen = [layers(k, hidden=False, **some)["occluder"] for k in range(5)]
-    assert np.mean(seen) < 0.01
+    some = {"steps": 90, "lr": 5e-3}
+    seen = [layers(k, hidden=False, **some)["occluder"] for k in (0, 3)]
+    assert all(alpha.max() > 0 for alpha in seen)
+    shown = [alpha[shots(False)[k].complete].mean() for alpha, k in zip(seen, (0, 3), strict=True)]
+    assert np.mean(shown) < 0.01, shown
     psnr = []
     for changes in ({}, {"occlusion": False}):
         avatar = boxed(False, **some, **changes)
         errors = []
-        for shot in shots(False):
+        for shot in shots(False)[:4]:
             rgb, _ = avatar.render(CAMERA, shot.view.body_pose)
             errors.append(np.square(rgb - shot.view.image / 255)[shot.complete])
         psnr.append(-10 * np.log10(np.concatenate(errors).mean()))
-    assert abs(psnr[0] - psnr[1]) < 0.4  # .08 here; so short a fit differs by .2 from one step to the next
+    assert abs(psnr[0] - psnr[1]) < 0.2, psnr
 
 
 # ------------------------------------------------------------------------------------------------ check 8: drawing
@@ -187,7 +199,7 @@ def test_check_7_with_nothing_hidden_the_layer_is_empty_and_the_fit_is_that_of_t
 
 def test_check_8_drawing_sees_neither_occluder_nor_background():
     view = shots()[0].view
-    avatar = fit_to(boxed_set(), replace(TINY, steps=2, scene="network"))
+    avatar = fit_to(boxed_set(), replace(TINY, steps=2, scene="network", body_fit=10))
     before = avatar.render(view.camera, view.body_pose)
     with torch.no_grad():
         for parameter in avatar.scene.parameters():
@@ -256,6 +268,7 @@ def test_every_term_changes_the_loss():
         "inside": 0.01,
         "completeness": 0.1,
         "background_alpha": 0.1,
+        "around": 0.1,
         "occlusion_loss": 1.0,
         "sparsity": 0.01,
     }
@@ -340,7 +353,7 @@ def test_a_resumed_fit_equals_an_uninterrupted_one_to_the_bit(views, saved, kill
 
 
 def test_the_same_seed_gives_the_same_bits_and_another_another(views):
-    some = [everything(fit_to(training_set(views), replace(TINY, steps=2), seed)) for seed in (0, 0, 1)]
+    some = [everything(fit_to(training_set(views), replace(TINY, steps=2, body_fit=10), seed)) for seed in (0, 0, 1)]
     assert equal_bits(*some[:2])
     assert not equal_bits(*some[1:])
 
@@ -349,9 +362,10 @@ def test_a_start_that_is_kept_is_the_start_that_is_fitted(views, monkeypatch):
     """The body fit is done once for the same network and body; the next has its result, to the bit."""
     from ihbench.methods.wild2avatar.person import body_fit
 
-    kept = everything(begun(TINY, training_set(views)))
+    config = replace(TINY, body_fit=10)
+    kept = everything(begun(config, training_set(views)))
     monkeypatch.setattr(body_fit, "_kept", {})
-    assert equal_bits(kept, everything(begun(TINY, training_set(views))))
+    assert equal_bits(kept, everything(begun(config, training_set(views))))
 
 
 def test_the_method_reports_its_stages_and_offers_its_avatar(views):

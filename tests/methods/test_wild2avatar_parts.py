@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from scipy.spatial import KDTree
 
 from ihbench.clock.threads import one_torch_thread
-from ihbench.methods.wild2avatar.config import PAPER, SMOKE
+from ihbench.methods.wild2avatar.config import PAPER, QUICK, SMOKE
 from ihbench.methods.wild2avatar.layers import Layer, background_layer, occlusion_layer, together
 from ihbench.methods.wild2avatar.losses import LEAST, Rays, binary_entropy, eikonal, ray_losses
 from ihbench.methods.wild2avatar.person.activation import sharp_softplus
@@ -32,7 +32,7 @@ from ihbench.methods.wild2avatar.person.ray_samples import (
 )
 from ihbench.methods.wild2avatar.person.sdf_network import RADIUS, SdfNetwork
 from ihbench.methods.wild2avatar.scene_network import SceneNetwork
-from ihbench.methods.wild2avatar.target import prepare_target
+from ihbench.methods.wild2avatar.target import beside_visible, prepare_target
 from ihbench.methods.wild2avatar.three_parts import inner_radius, three_parts
 from ihbench.render.volumes.density_laws import laplace_density, opacity
 from ihbench.scene.contracts import MaskState
@@ -58,7 +58,7 @@ def canonical():
 def like_the_body():
     """A field fitted to the body, and nothing else, with a surface that is not soft."""
     field = HumanField(replace(SMOKE, sdf_width=64, beta=0.005), torch.Generator().manual_seed(0))
-    fit_to_body(field.sdf, canonical(), 0, 420)
+    fit_to_body(field.sdf, canonical(), 0, 320)
     return field
 
 
@@ -442,6 +442,39 @@ def test_classes_of_pixels():
     assert torch.equal(prepare_target(filmed, 0, BODY, False, torch.device("cpu")).colours, target.colours)
 
 
+def test_beside_what_is_seen_of_the_body_nobody_is():
+    """The mask of a real occluder: a body of which the upper half is seen, in clothes a pixel wider on one side."""
+    body, mask = np.zeros((16, 16), bool), np.full((16, 16), MaskState.UNKNOWN, np.uint8)
+    body[4:12, 4:8] = True
+    mask[4:8, 4:9] = MaskState.PERSON
+    found = beside_visible(body, mask)
+    assert found[5, [1, 2, 10, 15]].all()
+    assert not found[5, [3, 9]].any(), "next to visible person: both are in the pixel"
+    assert not found[9:, :].any(), "beside what is hidden"
+    assert not (found & body).any()
+    assert not beside_visible(np.zeros_like(body), mask).any()
+
+
+def test_which_pixels_a_term_is_about():
+    target = a_target()
+    beside = target.unknown & ~target.body
+    assert beside.any()
+    reached = target.near < target.far
+    assert 0 < (target.background & reached).sum() < target.background.sum()
+    expected = {
+        "completeness": target.body | target.person,
+        "background": target.background & reached,
+        "around": beside,
+    }
+    for config, changed in ((QUICK, {}), (PAPER, {"background": target.background})):
+        shown = some_shown(target)
+        alpha = shown.human.requires_grad_()
+        terms = ray_losses(replace(shown, human=alpha), target, config, 0.0)
+        for name, where in (expected | changed).items():
+            (gradient,) = torch.autograd.grad(terms[name], alpha, retain_graph=True)
+            assert torch.equal(gradient != 0, where), name
+
+
 def test_rays_are_drawn_mostly_in_the_window_of_the_body():
     target = a_target()
     pixels = target.draw(1000, np.random.default_rng(0))
@@ -462,6 +495,7 @@ def test_each_term_by_hand():
     assert terms["colours"].item() == pytest.approx(colours.item())
     assert terms["completeness"].item() == pytest.approx(-0.1 * np.log(0.7 + LEAST))
     assert terms["background"].item() == pytest.approx(-0.1 * np.log(0.3 + LEAST))
+    assert terms["around"].item() == pytest.approx(PAPER.around * 0.7)
     assert terms["entropy"].item() == pytest.approx(-0.005 * 2 * (0.7 * np.log(0.7) + 0.3 * np.log(0.3)))
     assert terms["occlusion"].item() == pytest.approx(-np.log(0.8 + LEAST) - np.log(0.2 + LEAST), rel=1e-5)
     assert terms["sparsity"].item() == pytest.approx(0.01 * 0.2)

@@ -49,4 +49,6 @@ class _Slope(Function):
 
 def sharp_softplus(x: Tensor) -> Tensor:
     """ln(1 + e^(β x)) / β. Twice differentiable."""
+    if not torch.is_grad_enabled():
+        return F.softplus(x.clamp(min=FLAT), beta=SHARPNESS)
     return _Softplus.apply(x)  # type: ignore[return-value]
