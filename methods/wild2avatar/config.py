@@ -93,10 +93,10 @@ class Wild2AvatarConfig:
     """Weight of 1 - alpha on rays that hit the body, fading with e. Vid2Avatar's own is .01; the term of completeness
     has its place."""
     completeness: Annotated[float, WEIGHT] = 0.1
-    """Weight of -log of the person's alpha on rays that hit the body (L_comp) [inferred]."""
+    """Weight of -log of the person's alpha on rays that hit the body or show visible person (L_comp) [inferred]."""
     background_alpha: Annotated[float, WEIGHT] = 0.1
-    """Weight of -log(1 - alpha) of the person on known background [inferred: without it the distance field takes up a
-    plain background; Vid2Avatar's issue 45]."""
+    """Weight of -log(1 - alpha) of the person on background, known or beside a seen part of the body [inferred:
+    without it the distance field takes up a plain background; Vid2Avatar's issue 45]."""
     around: Annotated[float, WEIGHT] = 0.005
     """Weight of the person's alpha on unknown pixels beside the posed body [inferred]."""
     occlusion_loss: Annotated[float, WEIGHT] = 1.0

@@ -65,8 +65,9 @@ def beside_visible(
     if not body.any():
         return np.zeros_like(body)
     person = mask == MaskState.PERSON
-    rows, columns = distance_transform_edt(~body, return_distances=False, return_indices=True)
-    return ~body & ~binary_dilation(person, np.ones((3, 3))) & person[rows, columns]
+    rows, columns = np.asarray(distance_transform_edt(~body, return_distances=False, return_indices=True))
+    around = np.asarray(binary_dilation(person, np.ones((3, 3))), bool)
+    return ~body & ~around & person[rows, columns]
 
 
 def prepare_target(view: TrainView, row: int, body: Body, filmed: bool, device: torch.device) -> Target:
