@@ -43,16 +43,6 @@ def dissimilarity(
     return masked_mean(1 - similarity, weight)
 
 
-def ssim_distance(rgb: Tensor, image: Tensor) -> Tensor:  # [h, w, 3] in [0, 1]
-    """Mean of 1 - SSIM."""
-    return 1 - ssim_map_torch(rgb.permute(2, 0, 1), image.permute(2, 0, 1)).mean()
-
-
-def absolute_distance(rgb: Tensor, image: Tensor) -> Tensor:  # [h, w, 3]
-    """Mean absolute difference."""
-    return (rgb - image).abs().mean()
-
-
 def pyramid_distance(rgb: Tensor, image: Tensor) -> Tensor:  # [h, w, 3]
     """Mean absolute differences of a pyramid of band-passed images, each band half as fine as the one before, summed:
     edges and texture count beside colours, wherever they are a little displaced (Lap1 of Bojanowski et al. 2018)."""
@@ -64,14 +54,6 @@ def pyramid_distance(rgb: Tensor, image: Tensor) -> Tensor:  # [h, w, 3]
         total = total + (difference - smooth).abs().mean()
         difference = coarse
     return total + difference.abs().mean()
-
-
-# perceptual distances that need no weights, by name
-WEIGHT_FREE: dict[str, Perceptual] = {
-    "ssim": ssim_distance,
-    "l1": absolute_distance,
-    "pyramid": pyramid_distance,
-}
 
 
 def perceptual(net: str, device: torch.device) -> Perceptual | str:

@@ -82,7 +82,8 @@ class HumanNerfAvatar(nn.Module):
             (wide, wide // 2, wide // 2, wide // 4, wide // 4),
             config.box_margin,
         )
-        self.canonical = CanonicalNetwork(generator, config.depth, config.width, config.bands)
+        shape = config.depth, config.width, config.bands
+        self.canonical = CanonicalNetwork(generator, *shape, config.first_density)
         self.non_rigid = None
         if config.non_rigid:
             size = config.non_rigid_depth, config.non_rigid_width, config.non_rigid_bands

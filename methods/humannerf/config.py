@@ -90,9 +90,9 @@ class HumanNerfConfig:
     """Weight of the perceptual distance of patches: LPIPS where its trunk's weights are, else `without_lpips`."""
     lpips_net: Literal["vgg", "alex", "squeeze"] = "vgg"
     """Trunk of LPIPS."""
-    without_lpips: Literal["ssim", "l1", "pyramid", "none"] = "ssim"
-    """What takes its place where the weights are missing, and the record says so: 1 - SSIM, mean absolute difference,
-    that over bands of a pyramid, or nothing."""
+    without_lpips: Literal["pyramid", "none"] = "pyramid"
+    """What takes its place where the weights are missing, and the record says so: absolute differences over bands of
+    a pyramid, or nothing."""
     mse: Annotated[float, WEIGHT] = 0.2
     """Weight of the mean squared error of patches."""
     lr: Annotated[float, RATE] = 5e-4
@@ -105,6 +105,14 @@ class HumanNerfConfig:
     """Adam's step size of the network that corrects poses."""
     decay_steps: Annotated[int, Within(1, 100 * STEPS)] = 500_000
     """See `lr`."""
+    first_density: Annotated[float, Within(0, 1000)] = 0.0
+    """First bias of the density before its law, in 1/m. With 0, as released, first weights decide by chance whether
+    there is any density, and one step may be enough to lose it."""
+    warm_up: Annotated[int, STEP] = 0
+    """Steps over which all step sizes rise to their own; 0 as released."""
+    squared_first: Annotated[int, STEP] = 0
+    """Steps by squared error alone; over as many more the perceptual distance's weight rises to its own. 0 as
+    released."""
     guard: tuple[int, ...] = (100, 300, 1000, 2500, 5000)
     """Steps after which the fit starts again from other first weights where one of 16 pictures shows nothing."""
 
@@ -126,6 +134,8 @@ def in_steps(config: HumanNerfConfig, steps: int) -> HumanNerfConfig:
         kick_in=scaled(config.kick_in),
         full_band=scaled(config.full_band),
         decay_steps=max(scaled(config.decay_steps), 1),
+        warm_up=scaled(config.warm_up),
+        squared_first=scaled(config.squared_first),
         guard=((EARLY,) if steps // 6 > EARLY else ()) + (steps // 6, steps // 3, 2 * steps // 3),
     )
 
@@ -147,10 +157,11 @@ ON_A_CPU = HumanNerfConfig(
     lr_motion=3e-3,
     lr_non_rigid=5e-4,
     lr_poses=2e-4,
+    first_density=5.0,
 )
 
 PAPER = HumanNerfConfig()
-QUICK = replace(in_steps(ON_A_CPU, 400), steps=600)
+QUICK = replace(in_steps(ON_A_CPU, 400), steps=600, warm_up=50, squared_first=50)
 SMOKE = replace(
     in_steps(ON_A_CPU, 40),
     depth=4,
@@ -163,6 +174,8 @@ SMOKE = replace(
     patch_px=16,
     lr=5e-3,
     lr_motion=5e-3,
+    warm_up=5,
+    squared_first=5,
 )
 
 PROFILES = {"smoke": SMOKE, "quick": QUICK, "paper": PAPER}

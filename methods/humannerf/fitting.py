@@ -86,9 +86,18 @@ class HumanNerfFit(FieldOptimisation[HumanNerfAvatar]):
         rgb = shown.rgb
         if config.unknown == "ignore":
             rgb, image = where_known(rgb, image, unknown[..., None])
-        return patch_loss(rgb, image, config.mse, self._perceptual, config.lpips)
+        share = self._perceptual_share()
+        return patch_loss(rgb, image, config.mse, self._perceptual if share > 0 else None, config.lpips * share)
+
+    def _perceptual_share(self) -> float:
+        """Of the perceptual distance's weight, in this step."""
+        alone = self.avatar.config.squared_first
+        return min(max(self.step - alone, 0) / alone, 1.0) if alone else 1.0
 
     # --- the step ---
+
+    def _rate_share(self) -> float:
+        return super()._rate_share() * min((self.step + 1) / max(self.avatar.config.warm_up, 1), 1)
 
     def rng(self, what: int) -> np.random.Generator:
         return np.random.default_rng((self.seed, self.step, what, int(self.avatar.restarts)))

@@ -22,13 +22,21 @@ class CanonicalNetwork(nn.Module):
     canonical_mlps/mlp_rgb_sigma.py: 8 × 256 and ten octaves from 1 rad/m).
     """
 
-    def __init__(self, generator: torch.Generator, depth: int = 8, width: int = 256, bands: int = 10):
+    def __init__(
+        self,
+        generator: torch.Generator,
+        depth: int = 8,
+        width: int = 256,
+        bands: int = 10,
+        first_density: float = 0.0,  # first bias of the raw density
+    ):
         super().__init__()
         encoded = 3 + 6 * bands
         self.bands, self.again = bands, depth - 3
         inputs = [encoded, *(width + (encoded if k == self.again and k else 0) for k in range(1, depth))]
         self.hidden = nn.ModuleList(_layer(n, width, math.sqrt(2), generator) for n in inputs)
         self.last = _layer(width, 4, 1.0, generator)
+        nn.init.constant_(self.last.bias[3], first_density)
 
     def forward(self, places: Tensor) -> tuple[Tensor, Tensor]:  # [M, 3] m
         """rgb [M, 3] and raw density [M]."""

@@ -77,9 +77,9 @@ class OccNerfConfig:
     """Trunk of LPIPS."""
     mse: Annotated[float, WEIGHT] = 0.2
     """Weight of the mean squared error on patches."""
-    without_lpips: Literal["ssim", "l1", "pyramid", "none"] = "ssim"
-    """What takes its place where the weights are missing, and the record says so: 1 - SSIM, mean absolute difference,
-    that over bands of a pyramid, or nothing."""
+    without_lpips: Literal["pyramid", "none"] = "pyramid"
+    """What takes its place where the weights are missing, and the record says so: absolute differences over bands of
+    a pyramid, or nothing."""
     lr: Annotated[float, RATE] = 5e-4
     """Adam's step size of both networks."""
     lr_grid: Annotated[float, RATE] = 5e-4
@@ -115,7 +115,6 @@ ON_A_CPU = replace(
     weight_code=64,
     weight_channels=128,
     second_moment=0.99,
-    without_lpips="pyramid",
 )
 QUICK = replace(ON_A_CPU, steps=400, decay_steps=400, lr=4e-3, lr_grid=2e-2, lr_motion=5e-3)
 SMOKE = replace(

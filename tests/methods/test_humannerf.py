@@ -27,7 +27,7 @@ from .tiny_fit import SIZE, STRIP, equal_bits, training_set, training_views
 from .tiny_gaussians import SavesAt, events, killed_after
 
 BODY = the_body()
-SMALL = replace(TINY, steps=6, kick_in=2, full_band=5, patch_px=24, guard=())
+SMALL = replace(TINY, steps=6, kick_in=2, full_band=5, patch_px=24, guard=(), squared_first=0)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -87,7 +87,7 @@ def test_the_loss_is_squared_error_and_a_distance_of_patches(views):
 
 def test_without_weights_another_distance_stands_for_lpips_and_the_record_says_so(views, monkeypatch):
     monkeypatch.setattr("ihbench.fit.rays.patch_loss.perceptual", lambda net, device: f"no weights of {net}")
-    for instead, words in (("ssim", "ssim stands for it"), ("none", "nothing stands for it")):
+    for instead, words in (("pyramid", "pyramid stands for it"), ("none", "nothing stands for it")):
         ledger = Ledger()
         fitted(training_set(views), ledger=ledger, lpips=1.0, without_lpips=instead, steps=1)
         assert events(ledger, "left_out") == [{"what": "lpips term", "reason": f"no weights of vgg; {words}"}]
@@ -146,6 +146,42 @@ def test_the_method_reports_its_stages_and_offers_its_avatar(views):
     assert {"fit", "fit/prepare", "fit/field"} <= {row["stage"] for row in ledger.table()}
     assert offered[-1] == (SMALL.steps, avatar)
     assert equal_bits(everything(avatar), whole())
+
+
+# ------------------------------------------------------------------------------------------------------- the start
+
+
+def test_a_short_fit_begins_with_a_person_of_fog():
+    """Whatever its seed, with density wherever the person may be; as released about half of the seeds have none
+    anywhere, and ReLU lets no gradient through to change that."""
+    places = torch.from_numpy(np.array(BODY.shaped(np.zeros(10))[0])).float()
+
+    def least(config):
+        with torch.no_grad():
+            starts = [HumanNerfAvatar(config, BODY, np.zeros(10), seed).canonical(places)[1] for seed in range(6)]
+        return [raw.min().item() for raw in starts]
+
+    assert min(least(QUICK)) > 2.5
+    assert min(least(SMOKE)) > 2.5
+    assert min(least(replace(QUICK, first_density=0.0))) < -0.5
+
+
+def test_a_short_fit_begins_with_squared_error_and_small_steps(views):
+    """The perceptual distance comes in over as many steps as it was out for; step sizes rise in a straight line."""
+    fit = a_fit(training_set(views), mse=0.5, lpips=2.0, squared_first=10, warm_up=4, decay_steps=10_000)
+    fit._perceptual = lambda rgb, image: rgb.mean() * 0 + 1
+    extra = []
+    for fit.step in (0, 10, 15, 20, 200):
+        both = fit._loss(0).item()
+        fit._perceptual, distance = None, fit._perceptual
+        extra.append(both - fit._loss(0).item())
+        fit._perceptual = distance
+    assert extra == pytest.approx([0, 0, 1, 2, 2], abs=1e-5)
+    rates = []
+    for fit.step in (0, 1, 3, 100):
+        rates.append(fit._rate_share())
+    assert rates == pytest.approx([0.25, 0.5, 1, 1], rel=0.03)
+    assert (PAPER.first_density, PAPER.warm_up, PAPER.squared_first) == (0, 0, 0)
 
 
 # ------------------------------------------------------------------------------------------------------- the guard

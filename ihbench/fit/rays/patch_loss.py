@@ -7,19 +7,18 @@ from torch import Tensor
 
 from ihbench.clock.events import LeftOut
 from ihbench.clock.ledger import Ledger
-from ihbench.fit.losses import WEIGHT_FREE, Perceptual, perceptual
+from ihbench.fit.losses import Perceptual, perceptual, pyramid_distance
 
 
 def patch_distance(net: str, instead: str, device: torch.device, ledger: Ledger) -> Perceptual | None:
-    """LPIPS with one of its networks; where its weights are missing a distance of `WEIGHT_FREE`, or None for a name
-    that is none of them, and the ledger has an event that says so."""
+    """LPIPS with one of its networks. Where its weights are missing `pyramid_distance`, or None where another name
+    than `pyramid` is to stand for it, and the ledger has an event that says so."""
     distance = perceptual(net, device)
     if not isinstance(distance, str):
         return distance
-    other = WEIGHT_FREE.get(instead)
-    words = "nothing stands for it" if other is None else f"{instead} stands for it"
+    words = f"{instead} stands for it" if instead == "pyramid" else "nothing stands for it"
     ledger.event_once(LeftOut("lpips term", f"{distance}; {words}"))
-    return other
+    return pyramid_distance if instead == "pyramid" else None
 
 
 def patch_loss(

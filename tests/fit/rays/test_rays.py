@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from ihbench.fit.losses import WEIGHT_FREE
 from ihbench.fit.rays.marching import march_pixels, wanted_colors
 from ihbench.fit.rays.ray_target import PosedBox, meets_box, ray_target
 from ihbench.fit.rays.sampling import Pixels, draw_patches, draw_pixels
@@ -133,19 +132,3 @@ def test_pixels_through_a_ball(view, inside):
     again = march_pixels(Slab(), target, every, 256, background, np.random.default_rng(0), inside=inside)
     assert again.alpha[row, column].item() == pytest.approx(alpha, abs=2e-2)
     assert not torch.equal(again.depths, shown.depths)
-
-
-@pytest.mark.parametrize("name", list(WEIGHT_FREE))
-def test_weight_free_distances(name):
-    """0 for the same picture, positive otherwise, with a finite gradient; larger errors cost more."""
-    generator = torch.Generator().manual_seed(0)
-    image = torch.rand(32, 32, 3, generator=generator)
-    noise = torch.rand(32, 32, 3, generator=generator) - 0.5
-    distance = WEIGHT_FREE[name]
-    assert distance(image, image).item() == pytest.approx(0, abs=1e-6)
-    some, more = ((image + size * noise).clamp(0, 1).requires_grad_() for size in (0.1, 0.4))
-    assert 0 < distance(some, image) < distance(more, image)
-    distance(more, image).backward()
-    assert more.grad is not None
-    assert more.grad.isfinite().all()
-    assert more.grad.norm() > 0
