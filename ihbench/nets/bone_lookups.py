@@ -10,7 +10,7 @@ it, forward and back, and look only where a bone's weights are not negligible: i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -34,10 +34,16 @@ class BoneWeights:
     low: Tensor  # [3] m, corners of the lattice, whose outermost points lie on its faces
     high: Tensor  # [3] m
     maps: Tensor  # [J, 3, 4] from the posed frame to the T-pose
+    _boxes: dict[float, Tensor] = field(default_factory=dict, repr=False, compare=False)  # found so far, by `least`
 
     def boxes(self, least: float = 0.0) -> Tensor:
         """[J, 2, 3] lattice coordinates x, y, z: the box outside which each bone's trilinear weight is at most
-        `least`; of a bone without any larger one it is empty."""
+        `least`; of a bone without any larger one it is empty. Found once: a picture asks for them many times."""
+        if least not in self._boxes:
+            self._boxes[least] = self._found_boxes(least)
+        return self._boxes[least]
+
+    def _found_boxes(self, least: float) -> Tensor:
         volume = self.volume.detach()[: len(self.maps)]
         ends = []
         for axis in (3, 2, 1):  # x, y, z
