@@ -11,6 +11,7 @@ from ihbench.document import document
 from ihbench.document.short_names import LONG, with_short_names
 from ihbench.record.quality_time import Target
 from ihbench.record.results import RunResult
+from ihbench.record.shareable import shareable, without_places
 from ihbench.reports.general.content import general_report, score_tables
 from ihbench.reports.general.headline import headline_section
 
@@ -28,7 +29,10 @@ def write(
 ) -> str:
     """The report of these runs; see `general_report`. In LaTeX all row names are short, their switches stand below.
 
+    No text of it names a place of this machine.
+
     A page has the headline on top, the runs' own pictures in it, and diagrams: the ones given, else its own."""
+    results, left_out = shareable(results), [without_places(line) for line in left_out]
     longest = 0 if form == "tex" else LONG
     if fragment:
         return document.write_fragment(with_short_names(score_tables(results, presets), longest), form)

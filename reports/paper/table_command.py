@@ -98,6 +98,7 @@ def _results(chosen: TableOptions, protocols: list[str]) -> tuple[list[RunResult
     are there without one."""
     from ihbench.commands.report import say_left_out
     from ihbench.record.index import Index
+    from ihbench.record.shareable import shareable, without_places
 
     if not chosen.runs.is_dir():
         if chosen.runs != TableOptions.runs:
@@ -112,7 +113,7 @@ def _results(chosen: TableOptions, protocols: list[str]) -> tuple[list[RunResult
         left_out += without
     left_out = list(dict.fromkeys(left_out))
     say_left_out(left_out)
-    return results, left_out
+    return shareable(results), [without_places(line) for line in left_out]
 
 
 TABLE1 = TableCommand("table1", "The paper's Table 1: quoted rows, and what is measured here.")

@@ -10,6 +10,7 @@ from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.record import outputs
 from ihbench.record.results import RunResult
+from ihbench.record.shareable import shareable, without_places
 from ihbench.reports.site.frames import Files, OpenScenes, scene_frames
 from ihbench.reports.site.moving import avatars
 from ihbench.reports.site.page import Site
@@ -45,7 +46,8 @@ def build(
         raise BadInput("there is no run to show")
     progress = progress or Progress()
     files, scenes = Files(), scenes or OpenScenes(data, body)
-    content = site_tables(results, left_out)
+    results = shareable(results)
+    content = site_tables(results, [without_places(line) for line in left_out])
     frames = scene_frames(results, files, scenes, views, progress) if pictures else []
     moving, carried = avatars(results if pictures else (), frames, files, scenes, progress, share)
     content |= {"frames": [f.as_json for f in frames], **moving}

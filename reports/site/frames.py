@@ -22,6 +22,7 @@ from ihbench.metrics.images import bounds
 from ihbench.record.finished_run import FinishedRun
 from ihbench.record.results import RunResult, by_group, grouped
 from ihbench.record.schema import score_lines
+from ihbench.record.shareable import without_places
 from ihbench.scene.mask_state import MaskState
 from ihbench.scene.spread import spread
 from ihbench.scoring.scoring import LoadedView, Scorer
@@ -73,7 +74,7 @@ class SceneFrames:
     def as_json(self) -> dict[str, Any]:
         return {
             "group": self.group, "scene": self.scene, "runs": list(self.runs), "views": list(self.views),
-            "reason": self.reason,
+            "reason": without_places(self.reason),
         }  # fmt: skip
 
 

@@ -20,6 +20,7 @@ from ihbench.files.pictures import encoded, one_line
 from ihbench.metrics.eight_bit import displayed
 from ihbench.record.finished_run import FinishedRun
 from ihbench.record.results import RunResult
+from ihbench.record.shareable import without_places
 from ihbench.reports.site.avatars import PAINTED, BakedAvatar, price
 from ihbench.reports.site.baking import Baked, bake
 from ihbench.reports.site.corrections import Corrections, samples_of
@@ -73,6 +74,7 @@ def avatars(
             made[k] = _avatar(run, shown, files, carried, scenes, motions, share)
         except Exception as error:  # of somebody's method, too: one avatar must not take the page along
             reason = str(error) if isinstance(error, BadInput) else f"{type(error).__name__}: {one_line(error)}"
+            reason = without_places(reason, run.folder)
             made[k] = {"reason": reason, "turntable": [], "price": {}, "labels": {}, "capture": ""}
     return {
         "avatars": {str(k): about for k, about in made.items()},

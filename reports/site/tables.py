@@ -19,6 +19,7 @@ from ihbench.record.results import RunResult, by_group
 from ihbench.record.row_labels import by_label
 from ihbench.record.scene_means import per_scene, scene_means
 from ihbench.record.schema import ScoreLine, score_lines
+from ihbench.record.shareable import without_places
 from ihbench.reports.general.clock import machine_name, one_clock
 from ihbench.reports.general.significance import LEVEL, further_rows
 from ihbench.scene.method_spec import usable_specs
@@ -224,7 +225,7 @@ def _run(run: RunResult, group: int, label: str) -> Json:
         "facts": _facts(run),
         "repeat": f"ihbench run --like {run.folder.name}",
         "command": " ".join(("ihbench", *about.command)) if about.command else "",
-        "config": as_json(run.identity.config),
+        "config": _shown_config(run.identity.config),
     }
 
 
@@ -249,7 +250,20 @@ def _facts(run: RunResult) -> list[list[str]]:
         "commit": "" if git is None else f"{git.commit}{' and files that differ from it' if git.dirty else ''}",
         "packages": ", ".join(f"{name} {version}" for name, version in record.provenance.packages.items()),
     }
-    return [[name, str(value)] for name, value in facts.items() if value]
+    return [[name, without_places(str(value), run.folder)] for name, value in facts.items() if value]
+
+
+def _shown_config(config: Any) -> Any:
+    """Every switch as JSON, without places of the machine."""
+    match as_json(config):
+        case str(text):
+            return without_places(text)
+        case dict(items):
+            return {name: _shown_config(value) for name, value in items.items()}
+        case list(items):
+            return [_shown_config(value) for value in items]
+        case other:
+            return other
 
 
 def _views(run: RunResult, identities: Sequence[Identity], reasons: dict[str, int]) -> list[Json]:
@@ -263,16 +277,16 @@ def _views(run: RunResult, identities: Sequence[Identity], reasons: dict[str, in
             "camera": str(line.camera),
             "frame": line.frame,
             "group": line.row.removeprefix(run.method).strip(" []"),
-            "scores": [_score(line, i, reasons) for i in identities],
+            "scores": [_score(line, i, run, reasons) for i in identities],
         }
         for line in lines
     ]
 
 
-def _score(line: ScoreLine, identity: Identity, reasons: dict[str, int]) -> Any:
+def _score(line: ScoreLine, identity: Identity, run: RunResult, reasons: dict[str, int]) -> Any:
     value = float(line.scores.get(identity, math.nan))
     if math.isnan(value):
-        reason = line.absent.get(str(identity), "no reason recorded")
+        reason = without_places(line.absent.get(str(identity), "no reason recorded"), run.folder)
         return [reasons.setdefault(reason, len(reasons))]
     return number(value)
 
