@@ -8,6 +8,7 @@ const TABS = {
   avatar: ["Avatar", avatarTab],
   about: ["About", aboutTab],
 };
+const PICTURED = ["scenes", "frame", "avatar"]; // need files, which a single file has below the script
 let keys = {}; // of the screen that is shown: key -> what it does
 let shownGroup = null;
 let leaving = null; // what the screen that is shown has to end
@@ -31,8 +32,10 @@ function show() {
   document.getElementById("tabs").replaceChildren(...Object.entries(TABS).map(([key, [title]]) =>
     el("a", { href: link(key, { group: g }), "aria-current": key === name ? "page" : null }, title)));
   const main = document.getElementById("main");
+  const early = PICTURED.includes(name) && document.readyState === "loading";
+  if (early) document.addEventListener("DOMContentLoaded", show, { once: true });
   main.dataset.tab = name;
-  main.replaceChildren(...[group ? TABS[name][1](group, g, of) : el("p", {}, "There is no run here.")].flat(9).filter(Boolean));
+  main.replaceChildren(...[early ? el("p", { class: "note" }, "Reading the pictures.") : group ? TABS[name][1](group, g, of) : el("p", {}, "There is no run here.")].flat(9).filter(Boolean));
   restoreFocus(focus);
 }
 
