@@ -6,6 +6,7 @@ import io
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -104,20 +105,22 @@ class Exporter:
 
     # --- the mesh ---
 
-    def skinned_glb(self, named: str, clips: Sequence[tuple[str, Motion]]) -> bytes:
-        """The skinned mesh, standing in the named pose."""
+    def skinned_glb(self, named: str, clips: Sequence[tuple[str, Motion]], still: Motion | None = None) -> bytes:
+        """The skinned mesh, standing in the named pose; or as `still` has it, one frame that stands already."""
         from ihbench.export.skinned_glb import skinned_glb, standing
 
-        subject, made = self.subject, self.baked()
-        pose, relief = subject.pose(named), made.relief if self.relief else None
-        still = Motion(pose.pose[None], pose.transl[None], 1.0)
+        subject, made = self.subject, self.baked
+        relief = made.relief if self.relief else None
+        if still is None:
+            pose = subject.pose(named)
+            still = standing(Motion(pose.pose[None], pose.transl[None], 1.0), subject.body, subject.betas, relief)
         moving = {name: standing(motion, subject.body, subject.betas, relief) for name, motion in clips}
         extras = self._extras(holds_body=True, pose=named, texture=made.how, pose_blend_shapes=False)
         return skinned_glb(
             self._glb(holds_body=True),
             subject.body,
             subject.betas,
-            standing(still, subject.body, subject.betas, relief),
+            still,
             moving,
             made.texture,
             relief,
@@ -129,7 +132,7 @@ class Exporter:
         from PIL import Image
         from PIL.PngImagePlugin import PngInfo
 
-        made, words = self.baked(), PngInfo()
+        made, words = self.baked, PngInfo()
         for name, text in self._extras(holds_body=False, texture=made.how).items():
             words.add_text(name, str(text))
         words.add_text("Software", GENERATOR)
@@ -137,8 +140,9 @@ class Exporter:
         Image.fromarray(made.texture).save(buffer, "PNG", pnginfo=words, compress_level=9)
         return buffer.getvalue()
 
+    @cached_property
     def baked(self) -> Any:
-        """See `export.texture.Baked`."""
+        """The mesh's surface: made once, it may take minutes. See `export.texture.Baked`."""
         from ihbench.export.texture import baked
 
         subject = self.subject

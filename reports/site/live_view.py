@@ -17,13 +17,13 @@ import numpy as np
 
 from ihbench import registry
 from ihbench.body.canonical import canonical_pose
-from ihbench.body.pose import BodyPose
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.export.files import Exporter
+from ihbench.export.skinned_glb import standing
 from ihbench.record.finished_run import FinishedRun
 from ihbench.show.following import Following, Seen
-from ihbench.show.motion import find_motion, stand_of
+from ihbench.show.motion import Motion, Stand, find_motion
 from ihbench.show.subject import Subject
 
 HOST = "127.0.0.1"
@@ -31,6 +31,8 @@ EVERY = 1.0  # s between two looks at the run
 REST = "a_pose"
 FPS = 15.0
 AVATAR = "/avatar"  # in the scene
+HEIGHT, AWAY = 0.85, 4.4  # m: of the camera above the floor, and in front of the body
+FIELD = np.radians(30)  # what it sees, vertically
 TEXTURE = 256  # texels of a mesh's texture: it is made anew for every snapshot
 
 
@@ -52,10 +54,13 @@ class LiveView:
         self._data, self._body = data, body
         self._run: FinishedRun | None = None
         self._blur: float | None = None  # m, of its images' pixels
-        self._subject: Subject | None = None
+        self._exporter: Exporter | None = None  # of what is shown
+        self._motions: dict[str, Motion] = {}  # for its body
         self._changed = False
         self._handle: Any = None
         server.scene.set_up_direction("+y")
+        camera = server.initial_camera
+        camera.position, camera.look_at, camera.fov = (0.0, HEIGHT, AWAY), (0.0, HEIGHT, 0.0), FIELD
         self._words = server.gui.add_markdown("Waiting for the first snapshot of a run.")
         motions = registry.names("motion")
         self._motion = server.gui.add_dropdown("pose", (REST, *motions), initial_value=REST)
@@ -70,13 +75,13 @@ class LiveView:
         """Show what is new, if anything, and pose again what the page's controls have moved."""
         seen = self.following.look()
         if seen is not None and (subject := self._loaded(seen)) is not None:
-            self._subject, self._changed = subject, True
+            self._show(subject)
             self._words.content = f"**{seen.run.name}**: {seen.words}"
         if self.following.fault:
             self._words.content = self.following.fault
-        if self._changed and self._subject is not None:
+        if self._changed and self._exporter is not None:
             self._changed = False
-            self._draw(self._subject)
+            self._draw(self._exporter)
         return seen
 
     def _loaded(self, seen: Seen) -> Subject | None:
@@ -92,18 +97,31 @@ class LiveView:
             return None
         return subject if whole else None
 
-    def _pose(self, subject: Subject) -> BodyPose:
-        if self._motion.value == REST:
-            return BodyPose(canonical_pose(REST), subject.betas, np.zeros(3))
-        motion = find_motion(self._motion.value, FPS, subject.body, subject.betas)
-        return motion.body_poses(subject.betas)[min(int(self._time.value * len(motion)), len(motion) - 1)]
+    def _show(self, subject: Subject) -> None:
+        before = self._exporter
+        if before is None or not np.array_equal(before.subject.betas, subject.betas):
+            self._motions = {}
+        self._exporter = Exporter(subject, Progress.silent(), side=TEXTURE, footprint=self._blur)
+        self._blur = self._exporter.blur
+        self._changed = True
 
-    def _draw(self, subject: Subject) -> None:
-        pose, exporter = self._pose(subject), Exporter(subject, Progress.silent(), side=TEXTURE, footprint=self._blur)
-        self._blur = exporter.blur
+    def _pose(self, subject: Subject) -> Motion:
+        """One frame: the pose that the page's controls say, upright, on a floor at y = 0."""
+        name = self._motion.value
+        if name not in self._motions:
+            rest = Motion(canonical_pose(REST)[None], np.zeros((1, 3)), FPS)
+            motion = rest if name == REST else find_motion(name, FPS, subject.body, subject.betas)
+            self._motions[name] = standing(motion, subject.body, subject.betas)
+        motion = self._motions[name]
+        k = min(int(self._time.value * len(motion)), len(motion) - 1)
+        return Motion(motion.pose[k][None], motion.transl[k][None], FPS)
+
+    def _draw(self, exporter: Exporter) -> None:
+        subject = exporter.subject
+        still = self._pose(subject)
         if hasattr(subject.avatar, "posed_gaussians"):
-            stand = stand_of(subject.body, BodyPose(canonical_pose(REST), subject.betas, np.zeros(3)), _UP)
-            cloud = exporter.cloud(pose, "y-up", stand)
+            (pose,) = still.body_poses(subject.betas)
+            cloud = exporter.cloud(pose, "y-up", Stand(np.eye(3), np.zeros(3)))
             factors = _axes(cloud.quaternions) * cloud.scales[:, None, :]
             self._handle = self.server.scene.add_gaussian_splats(
                 AVATAR,
@@ -113,10 +131,7 @@ class LiveView:
                 cloud.opacities[:, None].astype(np.float32),
             )
         else:
-            self._handle = self.server.scene.add_glb(AVATAR, exporter.skinned_glb(REST, []))
-
-
-_UP = np.array([0.0, 1.0, 0.0])
+            self._handle = self.server.scene.add_glb(AVATAR, exporter.skinned_glb(self._motion.value, [], still))
 
 
 def _axes(quaternions: Any) -> Any:

@@ -149,13 +149,16 @@ def test_gaussians_reach_the_scene(bench, finished, tmp_path):
         with bench.in_its_world():
             view = LiveView(server, Following([_copied(finished.folder, "one", "done", tmp_path)]))
             assert view.look().number is None
-            subject = view._subject
+            subject = view._exporter.subject
             rest = view._handle.centers
-            assert len(rest) == len(subject.avatar.gaussians(view._pose(subject))[0])
+            (pose,) = view._pose(subject).body_poses(subject.betas)
+            assert len(rest) == len(subject.avatar.gaussians(pose)[0])
             assert 1.2 < np.ptp(rest[:, 1]) < 2.2  # m: it stands, y up
+            assert abs(rest[:, 1].min()) < 0.05  # on the floor
             assert "finished" in view._words.content
             view._motion.value, view._time.value, view._changed = "bow", 0.5, True
             assert view.look() is None
             assert np.ptp(view._handle.centers[:, 1]) < np.ptp(rest[:, 1]) - 0.05  # bent forward
+            assert abs(view._handle.centers[:, 1].min()) < 0.05  # where it stood
     finally:
         server.stop()
