@@ -115,16 +115,33 @@ def test_the_texture_lies_where_the_body_has_it(body, made):
     np.testing.assert_allclose(uv * (1, -1) + (0, 1), body.uv[body.uv_faces], atol=1e-6)
 
 
-def test_trimesh_reads_the_same(body, made):
-    file, data, _, texture = made
-    scene = trimesh.load(io.BytesIO(data), file_type="glb")
+def test_trimesh_reads_the_same(body, relief, made):
+    _, data, _, texture = made
+    scene = trimesh.load(io.BytesIO(data), file_type="glb", process=False)
     (mesh,) = scene.geometry.values()
-    assert len(mesh.faces) == len(body.faces)
-    box = file.attributes()["POSITION"]
-    np.testing.assert_allclose(mesh.vertices.min(0), box.min(0), atol=1e-6)
-    np.testing.assert_allclose(mesh.vertices.max(0), box.max(0), atol=1e-6)
+    vertex = SkinnedMesh.of(body).vertex
+    assert np.array_equal(vertex[mesh.faces], body.faces)
+    bind = body.pose(BodyPose(np.zeros((24, 3)), BETAS, np.zeros(3)), offsets=relief)
+    np.testing.assert_allclose(mesh.vertices, bind[vertex], atol=1e-5)
     assert trimesh.Trimesh(mesh.vertices, mesh.faces).volume > 0  # wound outwards
     assert np.array_equal(np.asarray(mesh.visual.material.baseColorTexture.convert("RGB")), texture)
+
+
+@pytest.mark.parametrize("seed", [4, 5, 6])
+def test_trimesh_poses_it_as_the_body(body, relief, seed):
+    """trimesh knows no skins: its graph of nodes carries its vertices, by the file's weights and joints."""
+    pose, transl = random_pose(seed), np.array([0.2, 1.0, -0.4])
+    still = Motion(pose[None], transl[None], 1.0)
+    data = skinned_glb(Glb("t"), body, BETAS, still, {}, np.zeros((8, 8, 3), np.uint8), relief, {})
+    scene = trimesh.load(io.BytesIO(data), file_type="glb", process=False)
+    (mesh,) = scene.geometry.values()
+    worlds = np.stack([scene.graph.get(name)[0] for name in JOINT_NAMES])
+    a = GlbFile(data).attributes()
+    from_rest = mesh.vertices[:, None] - body.shaped(BETAS)[1][a["JOINTS_0"]]
+    moved = np.einsum("ckab,ckb->cka", worlds[a["JOINTS_0"], :3, :3], from_rest) + worlds[a["JOINTS_0"], :3, 3]
+    seen = np.einsum("ck,cka->ca", a["WEIGHTS_0"].astype(float), moved)
+    expected = body.pose(BodyPose(pose, BETAS, transl), blend_shapes=False, offsets=relief)
+    np.testing.assert_allclose(seen, expected[SkinnedMesh.of(body).vertex], atol=1e-4)
 
 
 def test_the_four_largest_weights_are_kept():

@@ -12,10 +12,15 @@ from ihbench.clock.ledger import Ledger
 from ihbench.files import locks
 from ihbench.record.finished_run import FinishedRun
 from ihbench.record.store import LOCK, RunFolder
+from ihbench.reports.site import live_view
 from ihbench.runner import snapshots
 from ihbench.runner.snapshots import EVERY, Snapshots, ask, read_snapshot
 from ihbench.show.following import Following
 from ihbench.show.subject import Subject
+from tests.export.glb_reader import GlbFile
+from tests.show.test_render_command import gallery, mannequin_run
+
+__all__ = ["gallery", "mannequin_run"]
 
 
 class Saved:
@@ -138,6 +143,55 @@ def test_without_viser_one_line_names_the_extra(bench, finished, monkeypatch):
     outcome = bench("view", finished.folder, "--", "--protocol", "zju_occ")
     assert outcome.status == 2
     assert "go with --live" in outcome.err
+
+
+class Scene:
+    """A server as viser's, that keeps what it was given."""
+
+    def __init__(self):
+        self.scene = self.gui = self.initial_camera = self
+        self.files, self.position = [], None
+
+    def set_up_direction(self, axis): ...
+
+    def add_markdown(self, words):
+        return SimpleNamespace(content=words)
+
+    def add_dropdown(self, name, options, initial_value):
+        return SimpleNamespace(value=initial_value, on_update=lambda _: None)
+
+    def add_slider(self, name, initial_value, **bounds):
+        return SimpleNamespace(value=initial_value, on_update=lambda _: None)
+
+    def add_glb(self, name, data):
+        self.files.append(GlbFile(data))
+
+
+def test_a_mesh_moves_on_the_floor(bench, mannequin_run, monkeypatch):
+    """Of a method without Gaussians: in the pose that is asked for, its texture made once."""
+    from ihbench.export import texture
+
+    baked, made = texture.baked, []
+    monkeypatch.setattr(texture, "baked", lambda *words: made.append(1) or baked(*words))
+    monkeypatch.setattr(live_view, "TEXTURE", 32)
+    server = Scene()
+    with bench.in_its_world():
+        view = live_view.LiveView(server, Following([mannequin_run]))
+        view.look()
+        view._motion.value, view._time.value, view._changed = "bow", 0.5, True
+        view.look()
+        subject = view._exporter.subject
+        (pose,) = view._pose(subject).body_poses(subject.betas)
+        bent = subject.body.pose(pose, blend_shapes=False)
+    stood, moved = (file.posed() for file in server.files)
+    assert made == [1]
+    for posed in (stood, moved):
+        assert abs(posed[:, 1].min()) < 0.05
+    assert np.ptp(moved[:, 1]) < np.ptp(stood[:, 1]) - 0.05
+    assert abs(moved.max(0) - bent.max(0)).max() < 0.1  # but for the relief of its surface
+    _, y, z = server.position
+    assert z > 3  # m: from in front
+    assert 0 < y < np.ptp(stood[:, 1])
 
 
 def test_gaussians_reach_the_scene(bench, finished, tmp_path):
