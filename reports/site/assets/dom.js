@@ -146,7 +146,8 @@ function copied(text, node) {
   navigator.clipboard.writeText(text).then(() => said("copied"), () => said("not allowed here"));
 }
 
-const COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8c8c8c"];
+const COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8c8c8c", "#7b5cd6", "#a6761d", "#e7298a",
+  "#66a61e", "#1aa0a0"]; // Okabe and Ito's, then as many as there are systems
 
 function colourOf(k) {
   return COLOURS[k % COLOURS.length];
