@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from ihbench.clock.ledger import in_order
@@ -47,10 +47,17 @@ def site_tables(results: Sequence[RunResult], left_out: Sequence[str] = ()) -> J
         "runs": [
             _run(run, of_group[k], labels.get(k, run.about.label or run.method)) for k, run in enumerate(results)
         ],
-        "metrics": {name: _metric(name) for name in dict.fromkeys(i.metric for run in results for i in run.own)},
+        "metrics": {name: _metric(name) for name in dict.fromkeys(i.metric for run in results for i in _scored(run))},
         "left_out": list(left_out),
         "citations": _citations(dict.fromkeys(run.method for run in results)),
     }
+
+
+def _scored(run: RunResult) -> Iterator[Identity]:
+    """All that a run has numbers of: one that failed may have a curve alone."""
+    yield from run.own
+    for point in run.curve:
+        yield from point.scores
 
 
 def number(value: float) -> float | str | None:

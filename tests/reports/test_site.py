@@ -27,6 +27,7 @@ from ihbench.files.pictures import read_rgb
 from ihbench.record.finished_run import FinishedRun
 from ihbench.record.results import read_result, summary
 from ihbench.record.schema import score_lines
+from ihbench.record.shareable import without_places
 from ihbench.record.store import RunFolder
 from ihbench.render.spherical_harmonics import colors_of
 from ihbench.reports.site import avatars, baking, build, corrections, moving, painted, tables
@@ -36,7 +37,7 @@ from ihbench.scene.mask_state import MaskState
 from ihbench.scene.sightings import FINE
 from ihbench.scoring.scoring import Scorer
 from ihbench.show.subject import Subject
-from tests.reports import fake_runs
+from tests.reports import fake_runs, made_up_runs
 from tests.reports.site_reading import Page, Plates, sha256, unpacked, value
 
 HOSTILE = "<img src=x onerror=\"document.title='taken'\">&</script><script>alert(1)</script>"
@@ -73,7 +74,7 @@ def test_every_number_is_the_runs_own(page, results):
         for view, line in zip(shown["views"], lines, strict=True):
             for name, score in zip(shown["identities"], view["scores"], strict=True):
                 number = {str(i): v for i, v in line.scores.items()}[name]
-                expected = line.absent[name] if np.isnan(number) else number
+                expected = without_places(line.absent[name]) if np.isnan(number) else number
                 assert value(score, shown["reasons"]) == expected
                 compared += 1
         assert compared == len(lines) * len(run.own) > 20
@@ -124,6 +125,23 @@ def test_what_a_protocol_says_survives_as_toml():
         "of": {"rows": [1, [2, "x"]], "deeper": {"odd key!": "é", "empty": {}}}, "late": "value",
     }  # fmt: skip
     assert tomllib.loads(tables.toml(content)) == content
+
+
+def test_a_run_that_failed_has_a_curve_alone(tmp_path):
+    """Everything that a page shows of it has its metric's title and unit."""
+    run = made_up_runs.made_up(tmp_path)
+    outcome = replace(run.record.outcome, status="diverged", reason="lost")
+    run = replace(run, record=replace(run.record, outcome=outcome), rows={})
+    data = tables.site_tables([run])
+    named = {name.split("/")[0] for point in data["runs"][0]["curve"] for name in point["scores"]}
+    assert named == {"psnr", "flip"} == set(data["metrics"])
+    assert data["groups"][0]["identities"] == []
+
+
+def test_a_script_comes_before_what_a_page_carries(site):
+    """So that it draws before megabytes of pictures are read."""
+    order = list(Page(site.html(single=True)).inside)
+    assert order.index("data") < order.index("script") < min(k for k, name in enumerate(order) if "file-" in name)
 
 
 def test_marks_need_intervals():
@@ -438,7 +456,7 @@ def test_the_command(bench, finished, tmp_path, monkeypatch):
     )
     done = bench("site", finished.folder, finished.folder.parent, "--out", tmp_path / "a", "--views", "5")
     assert done.status == 0, done.err
-    assert f"{tmp_path / 'a' / 'index.html'}: 1 runs" in done.out
+    assert f"{tmp_path / 'a' / 'index.html'}: 1 run;" in done.out
     data = Page((tmp_path / "a" / "index.html").read_text()).data
     assert (data["n"], data["views"], data["share"]) == (1, 5, False)
     done = bench("site", finished.folder, "--single-file", "--out", tmp_path / "b.html")
@@ -448,6 +466,8 @@ def test_the_command(bench, finished, tmp_path, monkeypatch):
         ("site", tmp_path / "none"),
         ("view", tmp_path / "none"),
         ("site", finished.folder, "--views", "0"),
+        ("site", finished.folder, "--out", tmp_path / "b.html"),  # a file, or the name of one
+        ("site", finished.folder, "--out", tmp_path / "c.html"),
     ):
         refused = bench(*words)
         assert (refused.status, refused.err.count("\n")) == (2, 1), refused.err

@@ -5,6 +5,7 @@ import base64
 import io
 import json
 import shutil
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -21,6 +22,7 @@ from ihbench.reports.site import baking, build
 from ihbench.reports.site.corrections import Corrections
 from ihbench.show.subject import Subject
 from tests.reports.chromium import BROWSER, Chromium
+from tests.reports.made_up_runs import made_up
 from tests.reports.site_reading import Page, Plates, value
 
 pytestmark = pytest.mark.skipif(BROWSER is None, reason="no Chromium here: chromium, chromium-browser, google-chrome")
@@ -176,6 +178,21 @@ def test_a_name_that_means_harm_does_none(opened):
     assert browser.value("document.title") == build.TITLE
     browser.console.clear()  # these complaints were asked for
     browser.requests[:] = [url for url in browser.requests if not url.startswith("https://example.org")]
+
+
+def test_runs_that_failed_and_names_without_end(opened, tmp_path):
+    """Every screen is made, says why, and stays as wide as the window."""
+    failed = made_up(tmp_path, "W" * 90, "W" * 90, seed=1)
+    outcome = replace(failed.record.outcome, status="failed", reason=f"no {'W' * 200} there")
+    failed = replace(failed, record=replace(failed.record, outcome=outcome), rows={})
+    for name, runs in {"failed": [failed], "both": [made_up(tmp_path, "W" * 90, "W" * 90), failed]}.items():
+        page = tmp_path / f"{name}.html"
+        build.write_single(build.build(runs, [f"{'W' * 200}: is damaged"]), page)
+        for tab in ("leaderboard", "scenes", "frame", "curves", "avatar", "about"):
+            browser = opened(tab, page)
+            assert browser.value("document.documentElement.scrollWidth") <= 1300, (name, tab)
+            if tab in ("leaderboard", "about"):
+                assert outcome.reason in browser.value("document.getElementById('main').textContent")
 
 
 def test_on_a_telephone_in_the_dark_by_keys(opened):

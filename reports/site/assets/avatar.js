@@ -37,13 +37,13 @@ function avatarTab(group, g, of) {
       }),
     choice("motion", [["rest", view ? "as in that view" : "A-pose"], ...motions.map((m) => [m, m])], motion ?? "rest",
       (v) => { held.playing = true; held.t = 0; go("avatar", { group: g, run, camera: of.get("camera"), frame: of.get("frame"), motion: v }); }));
-  if (about.reason) return [head, el("p", {}, `It turns, but does not move here: ${about.reason}.`), turntable(about)];
+  if (about.reason) return [head, el("p", {}, `${about.turntable.length ? "It turns, but does not move here" : "It cannot be shown"}: ${about.reason}.`), turntable(about)];
   return [head, viewer(run, about, view, motion)];
 }
 
 // Pictures of the avatar from around: for methods that cannot be skinned in a page, and where there is no WebGL2.
 function turntable(about) {
-  if (!about.turntable.length) return el("p", { class: "note" }, "There are no pictures of it either.");
+  if (!about.turntable.length) return null;
   const image = picture(about.turntable[0], "the avatar from the front", { class: "still", tabindex: "0" });
   const slider = el("input", { type: "range", min: "0", max: String(about.turntable.length - 1), value: "0", "aria-label": "turn",
     oninput: () => { image.src = pictureUrl(about.turntable[slider.value]); } });
@@ -82,7 +82,7 @@ function viewer(run, about, view, motion) {
   const give = (reason) => {
     if (ended) return;
     ended = true;
-    place.replaceChildren(el("p", { class: "note" }, `${reason}; here are pictures of it.`), turntable(about));
+    place.replaceChildren(el("p", { class: "note" }, `${reason}; here are pictures of it.`), turntable(about) ?? "");
   };
 
   const pose = () => posed(avatar, view, clip);

@@ -36,6 +36,7 @@ function frameTab(group, g, of) {
   const a = scene.runs.includes(Number(of.get("a") ?? NaN)) ? Number(of.get("a")) : scene.runs[0];
   const b = scene.runs.includes(Number(of.get("b") || NaN)) ? Number(of.get("b")) : null;
   const run = DATA.runs[a];
+  if (!scene.views.length && !run.views.length) return el("p", {}, "There is no test view here, neither pictures nor scores.");
   const key = (v) => `${v.camera}/${v.frame}`;
   const wanted = of.get("camera") === null ? key(scene.views[0] ?? run.views[0]) : `${of.get("camera")}/${of.get("frame")}`;
   const view = scene.views.find((v) => key(v) === wanted);

@@ -13,7 +13,7 @@ function meansOf(group, row) {
 function leaderboardTab(group) {
   const metrics = [...new Set(group.identities.map((i) => i.metric))];
   const regions = [...new Set(group.identities.map((i) => i.region))];
-  if (!group.identities.length) return el("p", {}, "No run of this group is done.");
+  if (!group.identities.length) return [el("p", {}, "No run of this group is done."), unfinished(group)];
   board.metrics ??= new Set(metrics);
   const first = regions.filter((r) => [group.headline, "hidden"].includes(r));
   board.regions ??= new Set(first.length ? first : regions);
