@@ -18,6 +18,8 @@ from ihbench.record import outputs
 if TYPE_CHECKING:
     from ihbench.record.results import RunResult
 
+PAGES = (".html", ".htm")
+
 
 @dataclass(frozen=True)
 class SiteOptions:
@@ -41,6 +43,9 @@ class SiteOptions:
 
 def main(argv: list[str]) -> int:
     chosen = options(SiteOptions, argv, "site", "Finished runs as an offline page that shows them.")
+    is_page = chosen.out.suffix in PAGES
+    if not chosen.single_file and not chosen.out.is_dir() and (is_page or chosen.out.exists()):
+        raise BadInput(f"--out {chosen.out}: expected a folder; for everything in one file add --single-file")
     outputs.check_file(chosen.out, chosen.data, chosen.body, *chosen.runs)
     results, left_out = read_runs(chosen.runs)
     say_left_out(left_out)
@@ -48,12 +53,13 @@ def main(argv: list[str]) -> int:
     more: dict[str, Any] = {} if chosen.title is None else {"title": chosen.title}
     more |= {"share": chosen.share, "data": chosen.data, "body": chosen.body}
     site = general.build(results, left_out, views=chosen.views, **more)
+    count = f"{len(results)} run{'s' * (len(results) != 1)}"
     if chosen.single_file:
-        file = chosen.out if chosen.out.suffix in (".html", ".htm") else chosen.out / "index.html"
+        file = chosen.out if is_page else chosen.out / "index.html"
         size = general.write_single(site, file)
-        print(f"{file}: {size / 2**20:.1f} MB, {len(results)} runs; open it in a browser, it needs nothing else")
+        print(f"{file}: {size / 2**20:.1f} MB, {count}; open it in a browser, it needs nothing else")
     else:
-        print(f"{general.write_folder(site, chosen.out)}: {len(results)} runs; open it in a browser")
+        print(f"{general.write_folder(site, chosen.out)}: {count}; open it in a browser")
     return 0
 
 
