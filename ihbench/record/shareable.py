@@ -35,7 +35,7 @@ def without_places(text: str, folder: Path | None = None) -> str:
             return f"{quote}{'/'.join(own) or folder.name}{quote}"
         return f"{quote}{CUT}/{parts[-1]}{quote}"
 
-    if folder is not None and folder.is_absolute():  # its names may have anything in them
+    if folder is not None and len(folder.parts) > 1:  # its names may have anything in them
         text = text.replace(f"{folder}/", "").replace(str(folder), folder.name)
     return _ABSOLUTE.sub(cut, text)
 

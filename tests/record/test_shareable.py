@@ -51,6 +51,13 @@ def test_what_is_no_absolute_path_stays(text):
     assert without_places(text, RUN) == text
 
 
+def test_a_run_folder_named_from_here():
+    folder = Path("runs/zju_occ@1__a__ours__d1")
+    assert without_places(f"{folder}/avatar: cannot be read: {folder}/avatar/a.json", folder) == (
+        "avatar: cannot be read: avatar/a.json"
+    )
+
+
 def told_everywhere(said: str):
     """A run whose record names a place wherever it has words of its own."""
     files = PredictionFiles((said,), (said,), (said,), (said,), said)
