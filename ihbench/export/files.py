@@ -20,11 +20,11 @@ from ihbench.export.axes import WORDS, placement
 from ihbench.export.glb import Glb
 from ihbench.export.splat_cloud import SplatCloud, splat_cloud
 from ihbench.files.splat_ply import splat_ply
-from ihbench.render.splats import LOW_PASS
 from ihbench.show.motion import Motion, Stand, stand_of, up_axis
 from ihbench.show.subject import Subject
 
 BLUR = "the blur of a training image's pixel"
+WIDENED = 0.275  # px² of a training image: nearly the renderer's LOW_PASS, since viewers add a low-pass of their own
 CANONICAL = "a_pose"  # in which textures are baked: arms and legs are apart
 
 
@@ -61,10 +61,11 @@ class Exporter:
     @property
     def blur(self) -> float:
         """m, standard deviation of what the renderer's low-pass adds in the training images: the Gaussians learned
-        under it, and look as they were fitted only with it. 0 where the data are not at hand."""
+        under it, and look as they were fitted only with it. Not all of it: what `WIDENED` leaves is nearest to them in
+        three.js (`docs/`). 0 where the data are not at hand."""
         if self.footprint is not None:
             return self.footprint
-        return float(np.sqrt(LOW_PASS)) * (self.subject.pixel or 0.0)
+        return float(np.sqrt(WIDENED)) * (self.subject.pixel or 0.0)
 
     def ply(self, body_pose: BodyPose, axes: str, named: str, stand: Stand | None = None) -> bytes:
         """A splat PLY; its comments say what it is. Brush and splat-transform read the last one."""

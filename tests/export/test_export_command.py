@@ -60,12 +60,12 @@ def test_a_ply_has_the_gaussians_of_the_pose_upright_in_viewers(bench, finished,
     head = np.linalg.norm(seen * (-1, -1, 1) - own[15], axis=1) < 0.2
     foot = np.linalg.norm(seen * (-1, -1, 1) - own[10], axis=1) < 0.2
     assert up[head].mean() > 0.3 > -0.3 > up[foot].mean()
-    np.testing.assert_allclose(np.exp(table["scale_1"]) ** 2, scales**2 + 0.3 * pixel**2, rtol=1e-4)
+    np.testing.assert_allclose(np.exp(table["scale_1"]) ** 2, scales**2 + 0.275 * pixel**2, rtol=1e-4)
     assert said[2:] == [
         "data: stand-in v2 seed 0: a person made by the bench",
         f"pose: {pose}",
         "units: metres",
-        f"widened by: {1000 * 0.3**0.5 * pixel:.3g} mm (standard deviation), the blur of a training image's pixel",
+        f"widened by: {1000 * 0.275**0.5 * pixel:.3g} mm (standard deviation), the blur of a training image's pixel",
         "axes: y down, z forward (180 degrees about z from y-up); the pelvis at the origin",
         "SplatRenderMode: default",
     ]
