@@ -61,7 +61,7 @@ class Exporter:
     @property
     def blur(self) -> float:
         """m, standard deviation of what the renderer's low-pass adds in the training images: the Gaussians learned
-        under it, and look as they were fitted only with it. Not all of it: what `WIDENED` leaves is nearest to them in
+        under it, and look as they were fitted only with it. Not all of it: `WIDENED` is nearest to them in
         three.js (`docs/`). 0 where the data are not at hand."""
         if self.footprint is not None:
             return self.footprint

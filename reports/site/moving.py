@@ -14,6 +14,7 @@ from ihbench import registry
 from ihbench.body.canonical import canonical_pose
 from ihbench.body.pose import BodyPose
 from ihbench.body.skeleton import PARENTS
+from ihbench.camera import Camera
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.files.pictures import encoded, one_line
@@ -31,6 +32,7 @@ from ihbench.scene.regions import HIDDEN, NEVER_SEEN, VISIBLE
 from ihbench.scene.sightings import FINE
 from ihbench.scene.spread import spread
 from ihbench.scoring.scoring import Scorer
+from ihbench.show.detail import drawn
 from ihbench.show.framing import Framing, orbit
 from ihbench.show.motion import Motion, Stand, find_motion, placed, stand_of
 from ihbench.show.subject import CAPTURE, Subject
@@ -44,6 +46,7 @@ PRICED_VIEWS = 4
 PRICED_MOTIONS = ("bow", "march")
 AROUND, SIDE = 12, 256  # pictures of a turntable, and their px
 FEW, PATIENCE = 4, 20.0  # of a method whose first two pictures take longer than that, s
+GROUND = (1.0, 1.0, 1.0)
 QUALITY = 88  # of these pictures: they are to be looked at, nothing is measured on them
 PROCEDURAL = "procedural"
 BAKING_POSES = 6
@@ -120,6 +123,7 @@ def _avatar(
         "own": carried.add(own, ".bin"),
         "skin": carried.add(skin, ".bin"),
         "labels": _shares(made.avatar),
+        "pixel": subject.pixel,
         "capture": name if name in motions else "",
         "price": _prices(made.avatar, subject, scorer, shown, clips, corrections),
         "corrected": corrections and corrections.about | {"file": carried.add(corrections.packed(), ".bin")},
@@ -201,15 +205,19 @@ def _framing(subject: Subject, pose: BodyPose) -> Framing:
 
 
 def _turntable(subject: Subject, files: Files) -> list[str]:
-    """Pictures of the A-pose from around, the first from the front."""
+    """Pictures of the A-pose from around, the first from the front; drawn no finer than it was photographed."""
     pose = BodyPose(canonical_pose(A_POSE), subject.betas, np.zeros(3))
     framing, names = _framing(subject, pose), []
+
+    def picture(camera: Camera) -> NDArray[np.float32]:
+        return drawn(subject.avatar, camera, pose, GROUND, None, subject.body, subject.pixel)[0]
+
     begun = time.monotonic()
-    subject.avatar.render(framing.camera(0, 0.0, SIDE, SIDE), pose)  # compiles, where something is compiled
-    first = subject.avatar.render(framing.camera(0, 0.0, SIDE, SIDE), pose)
+    picture(framing.camera(0, 0.0, SIDE, SIDE))  # compiles, where something is compiled
+    first = picture(framing.camera(0, 0.0, SIDE, SIDE))
     around = AROUND if time.monotonic() - begun < PATIENCE else FEW
     for k, camera in enumerate(orbit(framing, around, SIDE, SIDE)):
-        rgb, _ = first if k == 0 else subject.avatar.render(camera, pose)
+        rgb = first if k == 0 else picture(camera)
         names.append(files.add(encoded(displayed(np.asarray(rgb)), "WEBP", quality=QUALITY), ".webp"))
     return names
 

@@ -8,6 +8,7 @@ import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -282,6 +283,19 @@ def test_general_gaussians_are_drawn_as_the_bench_draws_them(opened, studio, sit
             assert np.quantile(np.abs(seen[..., 3] - alpha)[alpha > 0.02], 0.99) < 0.06
         stood, _ = made.avatar.render(body, truth.camera, bowed, (1.0, 1.0, 1.0))
         assert psnr(displayed(stood), displayed(np.clip(rgb, 0, 1)), alpha > 0.02) < near - 5  # arms uncorrected
+
+
+def test_drawn_large_an_avatar_has_no_gaps(opened, site, tmp_path):
+    """It learned under the blur of its images' pixels, and is drawn with it."""
+
+    def gaps(page):
+        solid = (drawn(opened("avatar?run=0&motion=march&t=0.2", page))[..., 3] > 0.5).astype(np.uint8)
+        filled = cv2.morphologyEx(solid, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8))
+        return 1 - solid.sum() / filled.sum()
+
+    without = {"0": {**site.data["avatars"]["0"], "pixel": None}}
+    build.write_single(replace(site, data={**site.data, "avatars": without}), tmp_path / "without.html")
+    assert gaps(None) < 0.02 < gaps(tmp_path / "without.html")
 
 
 def test_painting_turning_and_a_lost_context(opened):

@@ -86,7 +86,7 @@ function viewer(run, about, view, motion) {
   };
 
   const pose = () => posed(avatar, view, clip);
-  const camera = () => (view ? fixedCamera(view) : freeCamera(avatar, canvas));
+  const camera = () => (view ? fixedCamera(view) : { ...freeCamera(avatar, canvas), grain: about.pixel });
   function draw(now) {
     frame = null;
     if (ended || !splats) return;
@@ -112,7 +112,7 @@ function viewer(run, about, view, motion) {
     splats.load(avatar);
     canvas.readback = () => splats.pixels(); // for checks: what was drawn, premultiplied
     const bytes = fileText(about.own).length * 0.75 + fileText(about.skin).length * 0.75;
-    said.textContent = `${avatar.count.toLocaleString("en")} Gaussians, ${(bytes / 2 ** 20).toFixed(2)} MB in this page.`;
+    said.textContent = `${avatar.count.toLocaleString("en")} Gaussians, ${(bytes / 2 ** 20).toFixed(2)} MB in this page.${view || !about.pixel ? "" : " Drawn no finer than it was photographed."}`;
     changed();
   }).catch((error) => give(String(error.message ?? error)));
   leaving = () => {

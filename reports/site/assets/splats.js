@@ -24,6 +24,7 @@ uniform vec4 joints[${3 * JOINTS}];
 uniform vec4 view[3];        // world to camera, row by row
 uniform vec4 lens;           // fx fy cx cy, px
 uniform float skew;
+uniform float grain;          // m of the finest detail there is: a training pixel's; 0 for as the camera sees it
 uniform vec2 size;           // px
 uniform int tinted;          // bit k: label k is painted over; bit 8: surface that a painter made
 in uint number;
@@ -87,7 +88,8 @@ void main() {
     float v = place.w * place.w * lens.x * lens.y / (p.z * p.z);
     footprint = vec3(v, 0., v);
   }
-  footprint += vec3(${LOW_PASS}, 0., ${LOW_PASS});
+  float fine = max(1., grain * sqrt(lens.x * lens.y) / p.z);  // px that a training pixel covers, if it is larger
+  footprint += ${LOW_PASS} * fine * fine * vec3(1., 0., 1.);
   float area = footprint.x * footprint.z - footprint.y * footprint.y;
   inverse = vec3(footprint.z, -footprint.y, footprint.x) / area;
   vec2 reach = sqrt(2. * log(max(255. * opacity, 1.)) * footprint.xz) + .5;
@@ -134,7 +136,7 @@ class Splats {
     if (!gl.getProgramParameter(this.program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(this.program) ?? "no program");
     gl.useProgram(this.program);
     this.at = Object.fromEntries(["places", "skins", "shapes", "harmonics", "degree", "tone", "eye", "general", "largest", "joints", "view", "lens",
-      "skew", "size", "tinted"].map((name) => [name, gl.getUniformLocation(this.program, name)]));
+      "skew", "grain", "size", "tinted"].map((name) => [name, gl.getUniformLocation(this.program, name)]));
     gl.uniform1i(this.at.places, 0);
     gl.uniform1i(this.at.skins, 1);
     gl.uniform1i(this.at.shapes, 2);
@@ -189,7 +191,8 @@ class Splats {
     gl.vertexAttribDivisor(number, 1);
   }
 
-  // joints [12 × 24], rows of the transforms from rest to world; camera: R [9], t [3], fx fy cx cy skew width height
+  // joints [12 × 24], rows of the transforms from rest to world; camera: R [9], t [3], fx fy cx cy skew width height, and
+  // grain: Gaussians learn under the blur of a training pixel, and show gaps where they are drawn finer without it
   draw(joints, camera, tinted = 0) {
     const { gl, at, canvas } = this;
     if (gl.isContextLost()) return;
@@ -204,6 +207,7 @@ class Splats {
     gl.uniform3fv(at.eye, [0, 1, 2].map((k) => -(R[k] * t[0] + R[3 + k] * t[1] + R[6 + k] * t[2])));
     gl.uniform4f(at.lens, camera.fx, camera.fy, camera.cx, camera.cy);
     gl.uniform1f(at.skew, camera.skew);
+    gl.uniform1f(at.grain, camera.grain ?? 0);
     gl.uniform2f(at.size, camera.width, camera.height);
     gl.uniform1i(at.tinted, tinted);
     this.sort(joints, camera);
