@@ -138,6 +138,19 @@ def test_a_run_that_failed_has_a_curve_alone(tmp_path):
     assert data["groups"][0]["identities"] == []
 
 
+def test_numbers_of_different_identity_never_share_a_column():
+    one, other = (fake_runs.fake_run(scene, method) for scene, method in (("a", "ours"), ("a", "theirs")))
+    psnr = fake_runs.PSNR.format("body")
+    later = psnr.removesuffix("v1") + "v2"
+    scores = {i: mean for i, mean in other.own.items() if str(i) != psnr} | fake_runs.mean(later, 40.0)
+    (group,) = tables.site_tables([one, replace(other, rows={"theirs": scores})])["groups"]
+    assert {psnr, later} <= {column["name"] for column in group["identities"]}
+    ours, theirs = group["rows"][:2]
+    assert psnr in ours["means"].keys() - theirs["means"].keys()
+    assert later in theirs["means"].keys() - ours["means"].keys()
+    assert not {psnr, later} & {*ours["marks"], *theirs["marks"]}  # nothing to compare with
+
+
 def test_a_script_comes_before_what_a_page_carries(site):
     """So that it draws before megabytes of pictures are read."""
     order = list(Page(site.html(single=True)).inside)

@@ -21,6 +21,7 @@ from ihbench.record.finished_run import FinishedRun
 from ihbench.record.results import read_result
 from ihbench.reports.site import baking, build
 from ihbench.reports.site.corrections import Corrections
+from ihbench.show import movie
 from ihbench.show.subject import Subject
 from tests.reports.chromium import BROWSER, Chromium
 from tests.reports.made_up_runs import made_up
@@ -204,6 +205,7 @@ def test_on_a_telephone_in_the_dark_by_keys(opened):
         for tab in ("leaderboard", "scenes", "frame", "curves", "avatar", "about"):
             opened(tab)
             assert browser.value("document.documentElement.scrollWidth") <= 390, tab
+            assert browser.value("document.querySelector('header .badge').textContent") == "stand-in data", tab
         background = browser.value("getComputedStyle(document.body).backgroundColor")
         assert background == "rgb(20, 23, 27)"
         opened("frame")
@@ -333,3 +335,19 @@ def test_a_folder_opens_too(opened, site, tmp_path):
     assert Page(index.read_text()).policy["img-src"] == "'self' data: blob:"
     with pytest.raises(AssertionError):  # and the check can fail
         assert browser.value("document.querySelector('canvas') !== null")
+
+
+def test_an_animation_of_ours_plays(browser, tmp_path):
+    colours = ((255, 0, 0), (0, 0, 255))
+    frames = [np.full((32, 48, 3), colour, np.uint8) for colour in colours]
+    (tmp_path / "turn.webp").write_bytes(movie.encoded(iter(frames), ".webp", 5))
+    (tmp_path / "page.html").write_text('<!DOCTYPE html><link rel="icon" href="data:,"><img src="turn.webp">')
+    browser.open((tmp_path / "page.html").as_uri(), "document.images[0]?.naturalWidth === 48")
+    seen = set()
+    for _ in range(200):
+        shot = browser.send("Page.captureScreenshot", format="png")["data"]
+        pixels = np.asarray(Image.open(io.BytesIO(base64.b64decode(shot))).convert("RGB"))
+        seen.add(tuple((pixels[20, 20] > 128).tolist()))
+        if len(seen) == 2:
+            break
+    assert seen == {(True, False, False), (False, False, True)}
