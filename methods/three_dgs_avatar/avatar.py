@@ -12,7 +12,6 @@ from torch import Tensor, nn
 
 from ihbench.body import Body
 from ihbench.body.pose import BodyPose
-from ihbench.body.skinning_numpy import axis_angle_to_matrix
 from ihbench.camera import Camera
 from ihbench.config_fields import read
 from ihbench.fit.avatar_files import read_avatar, write_avatar
@@ -20,6 +19,7 @@ from ihbench.fit.decoded_cache import DecodedCache
 from ihbench.fit.gaussians.gaussian_set import SHAPES, Carried, Gaussians
 from ihbench.fit.gaussians.posed import PosedGaussians
 from ihbench.fit.gaussians.skinned_covariance import blended_linear, skinned_covariance
+from ihbench.fit.gaussians.view_colours import DEGREE, view_harmonics
 from ihbench.fit.training_poses import PoseTables, TrainingPoses, latent_codes
 from ihbench.methods.three_dgs_avatar.colours import FEATURE, LATENT, ColourNetwork, canonical_directions
 from ihbench.methods.three_dgs_avatar.config import ThreeDgsAvatarConfig
@@ -154,15 +154,13 @@ class ThreeDgsAvatar(nn.Module):
 
     @torch.no_grad()
     def posed_gaussians(self, body_pose: BodyPose) -> PosedGaussians:
-        """See `scene.contracts.Avatar`. Colours depend on the camera: these are seen from 3 m before the pelvis, with
-        the last latent code."""
+        """See `scene.contracts.Avatar`. Colours depend on the direction of view: these are the harmonics nearest to
+        them, with the last latent code."""
         posed = self.posed(self.star.frame(body_pose))
         pelvis = self.body.posed_joints(body_pose)[0]
-        before = pelvis + 3 * axis_angle_to_matrix(body_pose.pose[0])[:, 2]
-        camera = Camera(np.eye(3), np.eye(3), -before, 1, 1)  # its place is all that matters
-        colours = self.colours_of(posed, camera, None)
+        colours = view_harmonics(posed.means, pelvis, lambda camera: self.colours_of(posed, camera, None))
         opacities = self.gaussians.opacities
-        return PosedGaussians(posed.means, posed.covariances, colours, None, opacities, weights=posed.weights)
+        return PosedGaussians(posed.means, posed.covariances, colours, None, opacities, DEGREE, posed.weights)
 
     @torch.no_grad()
     def render(
