@@ -53,6 +53,7 @@ class BakedAvatar:
     harmonics: NDArray[np.uint8] | None = None  # [N, K, 3] above degree 0: 0 at 127, `reach` at 254; None: none
     colour_range: tuple[float, float] = (0.0, 1.0)
     reach: float = 1.0
+    turning: bool = False  # harmonics are of directions of view at rest, not in the world
 
     def __len__(self) -> int:
         return len(self.rest)
@@ -94,12 +95,18 @@ class BakedAvatar:
         """rgb [H, W, 3] and alpha [H, W] by the bench's own renderer."""
         import torch
 
+        from ihbench.render.spherical_harmonics import colors_of
         from ihbench.render.splat import render_gaussians
 
         def tensor(values: Array) -> torch.Tensor:
             return torch.from_numpy(np.ascontiguousarray(values, np.float32))
 
-        means, colours = tensor(self.means(body, body_pose, correction)), tensor(self.shades)
+        means, shades, degree = self.means(body, body_pose, correction), self.shades, self.degree
+        if self.turning:
+            rays = np.einsum("nba,nb->na", self.blend(body, body_pose, correction)[:, :, :3], means - camera.center)
+            parts = (torch.from_numpy(np.ascontiguousarray(part)) for part in (shades, rays, np.zeros(3)))
+            shades, degree = colors_of(*parts, self.degree).numpy(), None
+        means, colours = tensor(means), tensor(shades)
         with torch.no_grad():
             if self.turns is None or self.opacities is None:
                 rgb, alpha = render_gaussians(means, tensor(self.scales), colours, camera, background)
@@ -110,7 +117,7 @@ class BakedAvatar:
                 opacities = tensor(self.opacities / LEVELS8)
                 rgb, alpha = render_gaussians(
                     means, covariances, colours, camera, background,
-                    opacities=opacities, sh_degree=self.degree if self.harmonics is not None else None, preset="3dgs",
+                    opacities=opacities, sh_degree=degree if self.harmonics is not None else None, preset="3dgs",
                 )  # fmt: skip
         return rgb.clamp(0, 1).numpy(), alpha.numpy()
 
@@ -147,7 +154,7 @@ class BakedAvatar:
             "count": len(self), "low": self.low.tolist(), "size": self.size.tolist(),
             "scales": list(self.scale_range), "joints": np.round(self.joints, 7).tolist(),
             "general": self.turns is not None, "degree": self.degree, "colours": list(self.colour_range),
-            "reach": self.reach,
+            "reach": self.reach, "turning": self.turning,
         }  # fmt: skip
 
 

@@ -37,6 +37,7 @@ BONES = 4  # weights of a Gaussian that are kept
 ROUNDS = 3  # of rest positions and corrections, each from the other
 STILL = 0.0005  # m (root mean square) by which Gaussians may miss their places before joints are corrected
 BETTER = 0.8  # of that distance must be left for corrections to be worth their bytes
+DIRECTIONS = 64  # in which harmonics are turned; 16 unknowns
 SHADE = 0.01  # root mean square of a colour over all directions that harmonics left out may make up: 40 dB
 RARE = 0.001  # share of the numbers beyond a range that are cut
 
@@ -88,7 +89,8 @@ def bake(subject: Subject, poses: Sequence[BodyPose], seen: Visibility | None) -
         np.ones(len(whole)) if opacities is None else opacities,
     )  # fmt: skip
     scales, turns = _shapes([d.scales for d in drawn], [blend[:, :, :3] for blend in blends])
-    colours, harmonics, colour_range, reach = _colours(np.mean([d.colours for d in drawn], 0), opacities)
+    shared, turning = _shared([d.colours for d in drawn], [blend[:, :, :3] for blend in blends])
+    colours, harmonics, colour_range, reach = _colours(shared, opacities)
     low, size = rest.min(0), np.maximum(np.ptp(rest, 0), 1e-6)
     span = float(scales.min()), float(max(scales.max(), scales.min() * 1.0001))
     log_low, log_size = math.log(span[0]), math.log(span[1] / span[0])
@@ -109,6 +111,7 @@ def bake(subject: Subject, poses: Sequence[BodyPose], seen: Visibility | None) -
         harmonics,
         colour_range,
         reach,
+        turning and harmonics is not None,
     )
     if corrector is None:
         return Baked(made, None)
@@ -212,6 +215,45 @@ def _shapes(scales: Sequence[Array], linear: Sequence[Array]) -> tuple[Array, Ar
         return np.exp(np.mean([np.log(np.maximum(one, 1e-6)) for one in scales], 0)), None
     backs = [np.linalg.inv(turn) for turn in linear]
     return _axes_of(np.mean([b @ one @ b.swapaxes(1, 2) for b, one in zip(backs, scales, strict=True)], 0))
+
+
+def _shared(
+    colours: Sequence[Array],  # of each pose [N, 3], or harmonics [N, K, 3]
+    linear: Sequence[Array],  # [N, 3, 3] rest to world
+) -> tuple[Array, bool]:
+    """The mean over poses, and whether it is of directions of view at rest: harmonics of some methods turn with the
+    body, and differ less from pose to pose there than in the world."""
+    worlds = np.stack(colours)
+    if worlds.ndim < 4 or worlds.shape[2] == 1 or len(worlds) == 1:
+        return worlds.mean(0), False
+    apart = float(((worlds - worlds.mean(0)) ** 2).mean())
+    if apart < SHADE**2:
+        return worlds.mean(0), False
+    rests = np.stack([_at_rest_seen(one, blend) for one, blend in zip(colours, linear, strict=True)])
+    turning = bool(((rests - rests.mean(0)) ** 2).mean() < apart)
+    return (rests if turning else worlds).mean(0), turning
+
+
+def _at_rest_seen(
+    harmonics: Array,  # [N, K, 3] of directions of view in the world
+    linear: Array,  # [N, 3, 3]
+) -> Array:
+    """[N, K, 3] the same colours by the directions that the transposed transform takes to rest."""
+    import torch
+
+    from ihbench.render.spherical_harmonics import basis
+
+    degree = math.isqrt(harmonics.shape[1]) - 1
+    rest = np.random.default_rng(0).normal(size=(DIRECTIONS, 3))
+    rest /= np.linalg.norm(rest, axis=1, keepdims=True)
+    back = np.linalg.pinv(basis(torch.from_numpy(rest), degree).numpy())
+    out = np.empty_like(harmonics)
+    for some in np.array_split(np.arange(len(harmonics)), len(harmonics) // 4096 + 1):
+        world = np.einsum("nba,db->nda", np.linalg.inv(linear[some]), rest)
+        world /= np.linalg.norm(world, axis=2, keepdims=True)
+        values = basis(torch.from_numpy(world.reshape(-1, 3)), degree).numpy().reshape(len(some), DIRECTIONS, -1)
+        out[some] = back @ (values @ harmonics[some])
+    return out
 
 
 def _colours(

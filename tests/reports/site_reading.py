@@ -104,7 +104,8 @@ def unpacked(own: bytes, skin: bytes, about: dict[str, Any]) -> dict[str, np.nda
 @dataclass
 class Plates:
     """An avatar of flat, half transparent Gaussians on the body, of any colours, from every side others up to
-    `degree`. It says what skins it where it is `told`, and turns its elbows by itself where it is `learned`."""
+    `degree`. It says what skins it where it is `told`, turns its elbows by itself where it is `learned`,
+    and its colours with them where they are `turning`."""
 
     body: Any
     betas: np.ndarray
@@ -112,6 +113,7 @@ class Plates:
     degree: int | None = None
     told: bool = False
     learned: bool = False
+    turning: bool = False
 
     def __post_init__(self):
         from ihbench.body.uv import texel_table
@@ -135,10 +137,24 @@ class Plates:
         blend = np.tensordot(self.weights_, self.body.joint_transforms(pose)[:, :3], 1)
         factors = blend[:, :, :3] @ self.factors
         means = np.einsum("nab,nb->na", blend[:, :, :3], self.rest) + blend[:, :, 3]
-        parts = (means, factors @ factors.transpose(0, 2, 1), self.colours, self.opacities, self.weights_)
+        colours = self.turned(blend[:, :, :3]) if self.turning else self.colours
+        parts = (means, factors @ factors.transpose(0, 2, 1), colours, self.opacities, self.weights_)
         means, covariances, colours, opacities, weights = (torch.from_numpy(p.astype(np.float32)) for p in parts)
         told = weights if self.told else None
         return PosedGaussians(means, covariances, colours, None, opacities, self.degree, told)
+
+    def turned(self, linear):
+        """The harmonics in the world of colours that are seen from directions at rest."""
+        import torch
+
+        from ihbench.render.spherical_harmonics import basis
+
+        world = np.random.default_rng(1).normal(size=(80, 3))
+        world /= np.linalg.norm(world, axis=1, keepdims=True)
+        rest = np.einsum("nba,db->nda", linear, world)
+        rest /= np.linalg.norm(rest, axis=2, keepdims=True)
+        seen = basis(torch.from_numpy(rest.reshape(-1, 3)), 3).numpy().reshape(*rest.shape[:2], -1) @ self.colours
+        return np.linalg.pinv(basis(torch.from_numpy(world), 3).numpy()) @ seen
 
     @staticmethod
     def as_learned(pose):

@@ -249,19 +249,21 @@ def test_the_avatar_is_drawn_as_the_bench_draws_it(opened, studio, site, finishe
         assert psnr(displayed(stood), displayed(rgb)) < MOVED  # a motion that does not move would be seen
 
 
-def test_general_gaussians_are_drawn_as_the_bench_draws_them(opened, studio, site, finished, tmp_path):
-    """Flat and half transparent ones, from every side of other colours, whose elbows turn by themselves; in a test
-    view and moved."""
+@pytest.mark.parametrize("turning", [False, True])
+def test_general_gaussians_are_drawn_as_the_bench_draws_them(opened, studio, site, finished, tmp_path, turning):
+    """Flat and half transparent ones, from every side of other colours, which may turn with the body; elbows turn by
+    themselves; in a test view and moved."""
     view = site.data["frames"][0]["views"][0]
     with studio.in_its_world():
         scene = FinishedRun(finished.folder).scene
         truth = next(v for v in scene.test if (v.camera_id, v.frame) == (view["camera"], view["frame"]))
         body, pose = load_body(), truth.body_pose
-        avatar = Plates(body, pose.betas, degree=3, told=True, learned=True)
+        avatar = Plates(body, pose.betas, degree=3, told=True, learned=True, turning=turning)
         subject = SimpleNamespace(avatar=avatar, body=body, betas=pose.betas)
         made = baking.bake(subject, [v.body_pose for v in scene.train[:6]], None)  # type: ignore[arg-type]
         assert not isinstance(made, str)
         assert made.corrections is not None
+        assert made.avatar.turning == turning
         clip = site.data["motions"]["shared"]["bow"]
         angles = np.frombuffer(base64.b64decode(clip["pose"]), "<i2").reshape(-1, 24, 3)[clip["frames"] // 2] / 1e4
         bowed = BodyPose(np.concatenate([pose.pose[:1], angles[1:]]), pose.betas, pose.transl)

@@ -20,6 +20,7 @@ uniform int degree;
 uniform vec3 tone;           // colours: the least and the range; harmonics: what 254 of 255 stands for
 uniform vec3 eye;            // m, world
 uniform bool general;
+uniform bool turning;        // harmonics are of directions at rest
 uniform vec4 joints[${3 * JOINTS}];
 uniform vec4 view[3];        // world to camera, row by row
 uniform vec4 lens;           // fx fy cx cy, px
@@ -66,7 +67,8 @@ void main() {
   vec4 look = bytes(skin.z);
   int label = int(look.w);
   colour = tone.x + tone.y * look.rgb / 255.;
-  if (degree > 0) colour = max(colour + shade(normalize(world.xyz - eye)), 0.);
+  mat3 back = mat3(blend[0].xyz, blend[1].xyz, blend[2].xyz);  // the transposed transform
+  if (degree > 0) colour = max(colour + shade(normalize(turning ? back * (world.xyz - eye) : world.xyz - eye)), 0.);
   int part = label & 3;
   if ((label & 4) != 0 && (tinted & 256) != 0) part = 4;
   else if ((tinted & (1 << part)) == 0) part = -1;
@@ -77,7 +79,7 @@ void main() {
     vec4 a = texelFetch(shapes, two, 0), b = texelFetch(shapes, two + ivec2(1, 0), 0);
     opacity = b.z;
     mat3 shape = mat3(a.x, a.y, a.z, a.y, a.w, b.x, a.z, b.x, b.y);
-    mat3 turn = transpose(mat3(view[0].xyz, view[1].xyz, view[2].xyz)) * transpose(mat3(blend[0].xyz, blend[1].xyz, blend[2].xyz));
+    mat3 turn = transpose(mat3(view[0].xyz, view[1].xyz, view[2].xyz)) * transpose(back);
     vec2 beyond = ${CLAMP} * size / (2. * lens.xy);
     vec2 along = clamp(p.xy / p.z, -lens.zw / lens.xy - beyond, (size - lens.zw) / lens.xy + beyond);
     vec3 across = vec3(lens.x, skew, -lens.x * along.x - skew * along.y) / p.z, down = vec3(0., lens.y, -lens.y * along.y) / p.z;
@@ -135,7 +137,7 @@ class Splats {
     gl.linkProgram(this.program);
     if (!gl.getProgramParameter(this.program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(this.program) ?? "no program");
     gl.useProgram(this.program);
-    this.at = Object.fromEntries(["places", "skins", "shapes", "harmonics", "degree", "tone", "eye", "general", "largest", "joints", "view", "lens",
+    this.at = Object.fromEntries(["places", "skins", "shapes", "harmonics", "degree", "tone", "eye", "general", "turning", "largest", "joints", "view", "lens",
       "skew", "grain", "size", "tinted"].map((name) => [name, gl.getUniformLocation(this.program, name)]));
     gl.uniform1i(this.at.places, 0);
     gl.uniform1i(this.at.skins, 1);
@@ -180,6 +182,7 @@ class Splats {
     gl.uniform1i(this.at.degree, avatar.degree);
     gl.uniform3fv(this.at.tone, avatar.tone);
     gl.uniform1i(this.at.general, avatar.shapes ? 1 : 0);
+    gl.uniform1i(this.at.turning, avatar.turning ? 1 : 0);
     gl.uniform1f(this.at.largest, avatar.shapes ? ALPHA_MAX.general : ALPHA_MAX.opaque);
     this.order = new Uint32Array(avatar.count);
     this.keys = new Uint16Array(avatar.count);
@@ -369,7 +372,7 @@ async function unpacked(about) {
   const samples = moves ? moves.length / 2 / 12 / JOINTS : 0;
   return {
     count: n, rest, scales, shapes, colours: together(narrows(3)), labels: narrows(1)[0], harmonics: together(narrows(3 * above)),
-    degree: about.degree, tone: [about.colours[0], about.colours[1] - about.colours[0], about.reach],
+    degree: about.degree, tone: [about.colours[0], about.colours[1] - about.colours[0], about.reach], turning: about.turning,
     // of each of 288 numbers all samples
     corrections: samples ? { ...about.corrected, samples, levels: new Int16Array(wide(moves, 0, moves.length / 2).buffer) } : null,
     bones: together([0, 1, 2, 3].map((k) => narrow(skin, k * n))), weights: together([4, 5, 6, 7].map((k) => narrow(skin, k * n))),
