@@ -104,8 +104,8 @@ class BakedAvatar:
         means, shades, degree = self.means(body, body_pose, correction), self.shades, self.degree
         if self.turning:
             rays = np.einsum("nba,nb->na", self.blend(body, body_pose, correction)[:, :, :3], means - camera.center)
-            parts = (torch.from_numpy(np.ascontiguousarray(part)) for part in (shades, rays, np.zeros(3)))
-            shades, degree = colors_of(*parts, self.degree).numpy(), None
+            own, seen_along = (torch.from_numpy(np.ascontiguousarray(part)) for part in (shades, rays))
+            shades, degree = colors_of(own, seen_along, torch.zeros(3), self.degree).numpy(), None
         means, colours = tensor(means), tensor(shades)
         with torch.no_grad():
             if self.turns is None or self.opacities is None:
