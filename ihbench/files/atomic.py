@@ -70,8 +70,11 @@ def write_bytes(path: Path, *data: bytes | memoryview, durable: bool = True) -> 
             return
     except OSError as error:
         raise _explained(error, path) from error
-    with replaced(path, durable) as temporary, open(temporary, "wb") as file:
-        file.writelines(data)
+    with replaced(path, durable) as temporary:
+        temporary.write_bytes(data[0])
+        if data[1:]:
+            with open(temporary, "ab") as file:
+                file.writelines(data[1:])
 
 
 @contextmanager

@@ -62,7 +62,7 @@ def test_a_kill_between_list_and_file_makes_a_stranger_of_neither(tmp_path, monk
             calls.append(target)
             if target == failing and calls.count(target) == (1 if failing == path else 2):
                 raise KeyboardInterrupt
-            write(target, data, durable)
+            write(target, data, durable=durable)
 
         monkeypatch.setattr(atomic, "write_bytes", killed)
         with pytest.raises(KeyboardInterrupt):
