@@ -14,6 +14,7 @@ from ihbench.record.schema import About
 CUT = "…"
 _NAME = r"""[^\s/\\"'`<>|*?:;,()\[\]{}]"""  # what names of files are made of, outside quotes
 _WORDS = rf"(?:[ ]{_NAME}+){{1,4}}"  # of a name with spaces, which only a further separator gives away
+_RUN = re.compile(r"[^@]+@.+__s\d+__[0-9a-f]+")  # a run folder
 _ABSOLUTE = re.compile(
     rf"""(?P<quote>["'`])(?:file://)?(?:/|\\\\|[A-Za-z]:[\\/])(?P<quoted>[^"'`\n]+)(?P=quote)
     | (?:file://|(?<![\w./\\<>~{CUT}-]))
@@ -25,7 +26,8 @@ _ABSOLUTE = re.compile(
 
 def without_places(text: str, folder: Path | None = None) -> str:
     """The text with absolute paths (POSIX, Windows, file URLs) cut down to what they end with: "…/annots.npy". Paths
-    in `folder`, a run's own, wherever it lay when the text was written, begin at that folder: "avatar/weights.pt"."""
+    in `folder`, a run's own, wherever it lay when the text was written, begin at that folder: "avatar/weights.pt".
+    Of another run the folder's name is kept, which says which run it is."""
 
     def cut(found: re.Match[str]) -> str:
         quote = found["quote"] or ""
@@ -33,7 +35,8 @@ def without_places(text: str, folder: Path | None = None) -> str:
         if folder is not None and folder.name in parts:
             own = parts[parts.index(folder.name) + 1 :]
             return f"{quote}{'/'.join(own) or folder.name}{quote}"
-        return f"{quote}{CUT}/{parts[-1]}{quote}"
+        first = next((k for k, part in enumerate(parts) if _RUN.fullmatch(part)), len(parts) - 1)
+        return f"{quote}{CUT}/{'/'.join(parts[first:])}{quote}"
 
     if folder is not None and len(folder.parts) > 1:  # its names may have anything in them
         text = text.replace(f"{folder}/", "").replace(str(folder), folder.name)

@@ -35,6 +35,10 @@ HERE = "/home/jane"
         (f"see {RUN}/traceback.txt", "see traceback.txt"),
         (f"/else/{RUN.name}/checkpoints/a.pt: is cut off", "checkpoints/a.pt: is cut off"),
         (f"{RUN}: is damaged", f"{RUN.name}: is damaged"),
+        (
+            f"{HERE}/runs/zju_occ@1__a__b__quick__s0__4e0f/scores.jsonl: x",
+            "…/zju_occ@1__a__b__quick__s0__4e0f/scores.jsonl: x",
+        ),
     ],
 )
 def test_paths_are_cut_down_to_their_names(text, expected):
