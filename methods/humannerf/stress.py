@@ -17,8 +17,8 @@ from ihbench.stress.case import Answer
 from ihbench.stress.fit_cases import STEP, FitCases
 from ihbench.stress.six_views import training_set, views
 
-# whole pictures, so that a bad pixel is met; every part is on before the end; the released start, since 18 steps
-# do not undo a fog of 5/m
+# whole pictures, so that a bad pixel is met; every part is on before the end; no fog and whole steps from the first
+# on, since 18 steps do not undo a fog of 5/m
 TINY = replace(
     in_steps(SMOKE, 18),
     depth=4,
