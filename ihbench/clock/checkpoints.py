@@ -123,7 +123,10 @@ def _saved_with_torch(values: Tensors, metadata: dict[str, str]) -> bytes:
 
     named, seen = {}, set()
     for name, value in values.items():
-        tensor = torch.from_numpy(value) if isinstance(value, np.ndarray) else value
+        if isinstance(value, np.ndarray):  # torch warns of read-only ones
+            tensor = torch.from_numpy(value if value.flags.writeable else value.copy())
+        else:
+            tensor = value
         memory = tensor.untyped_storage()
         own = memory.nbytes() == tensor.nbytes and memory.data_ptr() not in seen
         seen.add(memory.data_ptr())

@@ -462,3 +462,31 @@ def test_an_artifact_lies_beside_the_record_under_a_known_name_only(tmp_path):
         with pytest.raises(ValueError, match="artifact: expected one of inpainting"):
             ledger.artifact(name, b"")
     assert (Ledger().artifact("inpainting.png", b"x"), Ledger().on_disk) == (None, False)  # nowhere to put it
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("on_disk", [True, False])
+@pytest.mark.parametrize("with_torch", [True, False])
+def test_views_shared_memory_and_read_only_arrays_come_back_as_they_were(tmp_path, on_disk, with_torch):
+    fixed = np.arange(6.0)
+    fixed.flags.writeable = False
+    values = {
+        "fixed": fixed,
+        "turned": np.arange(6.0).reshape(2, 3).T,
+        "one": np.array(2.5),
+        "none": np.zeros((0, 3)),
+    }
+    if with_torch:
+        whole = torch.arange(12.0).reshape(3, 4)
+        values |= {"whole": whole, "same": whole, "part": whole[1:, :2], "across": whole.T, "rows": whole[:2]}
+    ledger = Ledger(tmp_path if on_disk else None)
+    ledger.save_state("s", values, {})
+    before = {name: np.asarray(value).copy() for name, value in values.items()}
+    if with_torch:
+        whole += 1  # what is saved is what was there
+    loaded, _ = ledger.load_state("s")
+    assert loaded.keys() == values.keys()
+    for name, value in loaded.items():
+        assert type(value) is type(values[name])
+        assert value.shape == values[name].shape
+        np.testing.assert_array_equal(np.asarray(value), before[name], strict=True)
