@@ -200,6 +200,7 @@ def _draw_all(
     keep: bool,
 ) -> tuple[_Groups, _Drawn]:
     """Splats with a depth > 0, whose `records` have the first three colours, in every channel."""
+    _keep_memory()
     n, channels = colors.shape
     order, keys = np.empty(n, np.int32), np.empty(n, np.uint32)
     m, lowest, highest = in_sight(depth, order, keys)
@@ -213,6 +214,14 @@ def _draw_all(
             records[:, at : at + here.shape[1]] = here
         passes.append(_draw(elliptic, records, order, preset, bg, size, keep, rgb, alpha))
     return groups, _Drawn(passes, ranks_of(order, n) if keep else np.empty(0, np.int32), channels)
+
+
+@cache
+def _keep_memory() -> None:
+    """glibc gives the system back what is free beyond twice the largest block that it has ever seen freed (32 MB at
+    most), and to fault in anew what a picture needs takes longer than to draw it. So one block is freed that nobody
+    has touched."""
+    np.empty(31 << 20, np.uint8)
 
 
 @dataclass(frozen=True)
