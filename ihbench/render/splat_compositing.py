@@ -55,6 +55,19 @@ _FAST = {"contract", "nsz", "arcp"}
 ZERO, ONE, HALF = f32(0), f32(1), f32(0.5)
 
 
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def workspace(floats):
+    """A tile of so many floats, room for what is prepared of its segments, and the segments: one block that begins
+    with a page, so that how they lie to each other in the cache is no accident."""
+    room = np.empty(floats + SEGMENTS * (SEGMENT + 8) + 1024, np.float32)
+    start = (-room.ctypes.data % 4096) // 4
+    tile = room[start : start + floats]
+    start += floats
+    prepared = room[start : start + SEGMENTS * SEGMENT]
+    start += SEGMENTS * SEGMENT
+    return tile, prepared, room[start : start + SEGMENTS * 8].view(np.int32).reshape(SEGMENTS, 8)
+
+
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
 def find_dead(tile, t_stop, dead):
     """Mark the 16×16 px cells in which every pixel lets through less than `t_stop`; returns how many are left."""
@@ -89,8 +102,8 @@ def composite_tiles(
     [tiles · 2 · 32 · 64] gets what the backward pass needs of each pixel: T and last.
     """
     tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
-    tile, prepared = np.empty(TILE_HEIGHT * FORWARD_ROW, np.float32), np.empty(SEGMENTS * SEGMENT, np.float32)
-    segments, dead = np.zeros((SEGMENTS, 8), np.int32), np.ones((CELLS_X + 1) * (CELLS_Y + 1), np.bool_)
+    tile, prepared, segments = workspace(TILE_HEIGHT * FORWARD_ROW)
+    dead = np.ones((CELLS_X + 1) * (CELLS_Y + 1), np.bool_)
     least, most, ends, one, nothing = (
         broadcast(alpha_min), broadcast(alpha_max), broadcast(stop), broadcast(ONE), zeros(),
     )  # fmt: skip
@@ -194,8 +207,8 @@ def composite_tiles_backward(
     """Add one part of the tiles' gradients to `gradients` [entries, …], each at its slot; see `CIRCLE_GRADIENT`,
     `ELLIPSE_GRADIENT`."""
     tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
-    tile, prepared = np.empty(TILE_HEIGHT * BACKWARD_ROW, np.float32), np.empty(SEGMENTS * SEGMENT, np.float32)
-    segments, dead = np.zeros((SEGMENTS, 8), np.int32), np.ones(1, np.bool_)
+    tile, prepared, segments = workspace(TILE_HEIGHT * BACKWARD_ROW)
+    dead = np.ones(1, np.bool_)
     least, most, one, nothing = broadcast(alpha_min), broadcast(alpha_max), broadcast(ONE), zeros()
     color_at = CIRCLE_COLOR if elliptic is None else ELLIPSE_COLOR
     for turn in range(part, len(tile_order), parts):
