@@ -101,6 +101,10 @@ class Wild2AvatarConfig:
     """Weight of the person's alpha on unknown pixels beside the posed body [inferred]."""
     occlusion_loss: Annotated[float, WEIGHT] = 1.0
     """Weight of L_occ: -log(1 - A) of the layer on visible person, -log A where the body is hidden [inferred]."""
+    layer_over: Literal["all", "unknown"] = "all"
+    """Pixels whose colour is that of all layers together: all, or those alone whose mask does not say person or
+    background. Where it does, no occluder stands, and as long as the layer does the person is fitted darker or
+    lighter than it is, in short fits until it is black or white and has no gradient left."""
     sparsity: Annotated[float, WEIGHT] = 0.01
     """Weight of the layer's alpha elsewhere, part of L_occ [inferred]."""
     ramp_epochs: Annotated[float, Within(0, STEPS, above=True)] = 200.0
@@ -152,6 +156,7 @@ QUICK = replace(
     scene_depth=3,
     scene_skip=0,
     scene_samples=8,
+    layer_over="unknown",
     eikonal_points=128,
     ramp_epochs=20.0,
     refresh_epochs=10,

@@ -128,6 +128,9 @@ class Wild2AvatarFit(Optimisation[Wild2AvatarAvatar]):
         generator = torch.Generator().manual_seed(int(self._rng(SAMPLES).integers(2**62)))
         human, occlusion, background = self._layers(k, target, pixels, generator)
         colours = together(occlusion, human, background)
+        if config.layer_over == "unknown":
+            bare = together(None, human, background)
+            colours = torch.where(target.unknown[pixels][:, None], colours, bare)
         layer = None if occlusion is None else occlusion.alpha
         rays = Rays(pixels, colours, human.alpha, layer, human.beside)
         terms = ray_losses(rays, target, config, self.counted)
