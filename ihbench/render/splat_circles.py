@@ -1,4 +1,4 @@
-"""Opaque isotropic Gaussians for the renderer on the CPU: projection, packing, row segments, and the way back.
+"""Opaque isotropic Gaussians for the renderer on the CPU: projection, row segments, and the way back.
 
 A circle's footprint is the product of one across and one down: 32 exponentials for a block of 256 pixels.
 """
@@ -11,16 +11,7 @@ import numpy as np
 from numba import njit
 
 from ihbench.render.lanes import exp2, lanes, store, zeros
-from ihbench.render.splat_tiles import (
-    BLOCK,
-    TILE_HEIGHT,
-    TILE_WIDTH,
-    close_tiles,
-    count_tiles,
-    f32,
-    fetch_slots,
-    u64,
-)
+from ihbench.render.splat_tiles import TILE_HEIGHT, TILE_WIDTH, f32, fetch_slots, u64
 
 CIRCLE = 8  # floats of a packed circle: x, y, sharpness, reach, colour, padding
 CIRCLE_GRADIENT = 8  # floats of a slot: sums over dx, dy, d², colour, padding
@@ -73,50 +64,6 @@ def project_circles(
         p[0], p[1], p[2], p[3] = x, y, math.sqrt(f32(HALF_LOG2_E) / v), reach
         for c in range(u64(3)):
             p[u64(CIRCLE_COLOR) + c] = colors[i, c] if c < u64(colors.shape[1]) else ZERO
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
-def pack_circles(
-    records,
-    order,
-    alpha_min,
-    alpha_max,
-    t_stop,
-    height,
-    width,
-    packed,
-    boxes,
-    counts,
-    closed,
-    let_through,
-    slot_start,
-):
-    """Fill `packed` [M, CIRCLE] in depth order and what `splat_tiles` wants; returns the number of entries."""
-    entries, count = 0, len(order)
-    for block in range(0, count, BLOCK):
-        end, largest = min(block + BLOCK, count), ZERO
-        for rank in range(u64(block), u64(end)):
-            i, p = u64(order[rank]), packed[rank]
-            for c in range(u64(CIRCLE)):
-                p[c] = records[i, c]
-            largest = max(largest, p[3])
-        if largest <= f32(TILE_WIDTH):  # they hide no tile, and without calls all stays in registers
-            for rank in range(block, end):
-                p = packed[u64(rank)]
-                slot_start[u64(rank)] = entries
-                entries += count_tiles(rank, p[0], p[1], p[3], p[3], height, width, boxes, counts, closed)
-            continue
-        for rank in range(block, end):
-            p = packed[u64(rank)]
-            slot_start[u64(rank)] = entries
-            entries += count_tiles(rank, p[0], p[1], p[3], p[3], height, width, boxes, counts, closed)
-            if p[3] > f32(TILE_WIDTH):
-                close_tiles(
-                    rank, p[0], p[1], ZERO, p[2], p[2], ZERO, alpha_min, alpha_max, t_stop, width, boxes, let_through,
-                    closed,
-                )  # fmt: skip
-    slot_start[len(order)] = entries
-    return entries
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)

@@ -1,4 +1,4 @@
-"""General Gaussians for the renderer on the CPU: packing, row segments, and the way back to the covariance.
+"""General Gaussians for the renderer on the CPU: records, row segments, and the way back to the covariance.
 
 The exponent of a footprint is written as two squares, (dx - shear dy)² / Var(x | y) + dy² / Var(y) with
 shear = Cov(x, y) / Var(y). Each is exact to float32 however thin a needle is, where the inverse covariance's
@@ -27,16 +27,7 @@ from ihbench.render.lanes import (
     zeros,
 )
 from ihbench.render.splat_circles import SEGMENT, hidden
-from ihbench.render.splat_tiles import (
-    BLOCK,
-    TILE_HEIGHT,
-    TILE_WIDTH,
-    close_tiles,
-    count_tiles,
-    f32,
-    fetch_slots,
-    u64,
-)
+from ihbench.render.splat_tiles import TILE_HEIGHT, TILE_WIDTH, f32, fetch_slots, u64
 
 # floats of a packed ellipse: x, y, sharpness across a row and down, shear, log2 opacity, level (the exponent where
 # alpha ends), half width, half height, colour, padding
@@ -88,50 +79,6 @@ def ellipse_records(xy, covariance, opacity, colors, alpha_min, height, width, r
             depth[i] = ZERO
         for c in range(channels):
             records[i, ELLIPSE_COLOR + c] = colors[i, c]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def pack_ellipses(
-    records,
-    order,
-    alpha_min,
-    alpha_max,
-    t_stop,
-    height,
-    width,
-    packed,
-    boxes,
-    counts,
-    closed,
-    let_through,
-    slot_start,
-):
-    """Fill `packed` [M, ELLIPSE] in depth order and what `splat_tiles` wants; returns the number of entries."""
-    entries, count = 0, len(order)
-    for block in range(0, count, BLOCK):
-        end, largest = min(block + BLOCK, count), ZERO
-        for rank in range(u64(block), u64(end)):
-            i, p = u64(order[rank]), packed[rank]
-            for c in range(u64(ELLIPSE)):
-                p[c] = records[i, c]
-            largest = max(largest, min(p[7], p[8] * f32(TILE_WIDTH / TILE_HEIGHT)))
-        if largest <= f32(TILE_WIDTH / 2):  # they hide no tile, and without calls all stays in registers
-            for rank in range(block, end):
-                p = packed[u64(rank)]
-                slot_start[u64(rank)] = entries
-                entries += count_tiles(rank, p[0], p[1], p[7], p[8], height, width, boxes, counts, closed)
-            continue
-        for rank in range(block, end):
-            p = packed[u64(rank)]
-            slot_start[u64(rank)] = entries
-            entries += count_tiles(rank, p[0], p[1], p[7], p[8], height, width, boxes, counts, closed)
-            if p[7] > f32(TILE_WIDTH / 2) and p[8] > f32(TILE_HEIGHT / 2):
-                close_tiles(
-                    rank, p[0], p[1], p[4], p[2], p[3], p[5], alpha_min, alpha_max, t_stop, width, boxes, let_through,
-                    closed,
-                )  # fmt: skip
-    slot_start[len(order)] = entries
-    return entries
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST, forceinline=True)

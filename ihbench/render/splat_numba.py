@@ -1,8 +1,8 @@
 """The splat renderer on the CPU: numba, tiles of 64×32 px, explicit 16-lane vectors, analytic backward pass.
 
-`splat_gaussians` and `splat_circles` project, `splat_tiles` orders the splats and lists them per tile,
-`splat_ellipses` and `splat_circles` pack and cut them, `splat_compositing` draws the tiles; `README.md` beside them
-has what was tried and what it took. Gaussians go from the world to the picture and back in one piece
+`splat_gaussians` and `splat_circles` project, `splat_tiles` and `splat_packing` order the splats and list them per
+tile, `splat_ellipses` and `splat_circles` cut them, `splat_compositing` draws the tiles; `README.md` beside them has
+what was tried and what it took. Gaussians go from the world to the picture and back in one piece
 (`draw_gaussians`, and `draw_isotropic` for opaque circles); `composite` takes projected ones.
 
 Early stop: where no pixel of a 16×16 px cell lets through `T_STOP`, splats under such cells alone are left out. That
@@ -41,7 +41,6 @@ from ihbench.render.splat_circles import (
     CIRCLE_COLOR,
     CIRCLE_GRADIENT,
     circle_gradients,
-    pack_circles,
     project_circles,
 )  # fmt: skip
 from ihbench.render.splat_ellipses import (
@@ -50,9 +49,9 @@ from ihbench.render.splat_ellipses import (
     ELLIPSE_GRADIENT,
     ellipse_gradients,
     ellipse_records,
-    pack_ellipses,
 )  # fmt: skip
 from ihbench.render.splat_gaussians import gaussian_gradients, project_gaussians
+from ihbench.render.splat_packing import pack_splats
 from ihbench.render.splat_projection import clamped_directions, intrinsics
 from ihbench.render.splat_tiles import OPEN, TILE_HEIGHT, TILE_WIDTH, depth_order, fill_tiles, in_sight, ranks_of
 from ihbench.render.splats import PRESETS, Ellipses, Preset, Splats, as_ellipses
@@ -161,7 +160,7 @@ def _draw(
     height, width = size
     tiles_x, tiles_y = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
     tiles = tiles_x * tiles_y
-    count, pack = len(order), pack_ellipses if elliptic else pack_circles
+    count = len(order)
     packed = np.empty((count, records.shape[1]), f32)
     boxes, slot_start = np.empty((count, 4), np.int32), np.empty(count + 1, np.int32)
     tile_start, closed, let_through = (
@@ -170,7 +169,9 @@ def _draw(
         np.ones(tiles, f32),
     )
     limits = preset.alpha_min, preset.alpha_max, T_STOP, height, width
-    entries = pack(records, order, *limits, packed, boxes, tile_start, closed, let_through, slot_start)
+    entries = pack_splats(
+        elliptic, records, order, *limits, packed, boxes, tile_start, closed, let_through, slot_start
+    )
     if entries > np.iinfo(np.int32).max:
         raise MemoryError(f"splats: {entries} pairs of splat and tile, more than this back end can index")
     ranks, slots = np.empty(entries, np.int32), np.empty(entries, np.int32)

@@ -14,7 +14,6 @@ from ihbench.render.lanes import prefetch
 
 TILE_WIDTH, TILE_HEIGHT = 64, 32  # px
 SHIFT_X, SHIFT_Y = 6, 5
-BLOCK = 64  # splats gathered together
 AHEAD = 16  # how many splats ahead a loop asks for what it will gather
 
 f32, u64 = np.float32, np.uint64
