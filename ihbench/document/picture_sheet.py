@@ -6,6 +6,7 @@ matplotlib is imported when something is drawn.
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from textwrap import fill
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 WIDTH = 7.0  # in, of two columns of a paper
 DPI = 300
-LETTERS, SMALL = 7.0, 5.5  # pt
+LETTERS, SMALL, SMALLEST = 7.0, 5.5, 4.0  # pt
 LINE, NOTE, GAP = 0.11, 0.11, 0.03  # in: a line of a head, the line under a panel, between panels
 LETTER = 0.56  # mean width of a letter over the font's size
 TALLEST = 2.2  # times its width that a panel may be high
@@ -77,7 +78,7 @@ class PictureSheet:
         width = min((WIDTH - side - GAP * (across - 1)) / across, max(widest * PIXEL, 0.6))
         scales = [_scale(panels, width) for _, panels in self.rows]
         heights = [scale * _tallest(panels) for scale, (_, panels) in zip(scales, self.rows, strict=True)]
-        heads = [_Head.fitting(head, height) for (head, _), height in zip(self.rows, heights, strict=True)]
+        heads = [_heads([head], height)[0] for (head, _), height in zip(self.rows, heights, strict=True)]
         return width, scales, heights, heads
 
     def _drawn(self) -> Figure:
@@ -88,7 +89,7 @@ class PictureSheet:
         *_, heads = self._measured(2 * LINE)  # the rows' heads, turned; long ones take more lines
         side = max(head.height for head in heads)
         width, scales, heights, heads = self._measured(side)
-        tops = [_Head.fitting(head, width) for head in self.columns]
+        tops = _heads(self.columns, width)
         top = max(head.height for head in tops)
         noted = [NOTE if any(p is not None and p.note for p in panels) else 0.0 for _, panels in self.rows]
         total_width = side + across * width + GAP * (across - 1)
@@ -141,17 +142,21 @@ class _Head:
     text: str
     size: float  # pt
 
-    @classmethod
-    def fitting(cls, text: str, room: float) -> _Head:  # in
-        """Large in one line where that fits, else small in several."""
-        if len(text) * LETTER * LETTERS <= room * 72:
-            return cls(_plain(text), LETTERS)
-        return cls(_plain(fill(text, max(int(room * 72 / (LETTER * SMALL)), 8))), SMALL)
-
     @property
     def height(self) -> float:
         """in"""
         return LINE * (self.text.count("\n") + 1.5)
+
+
+def _heads(texts: Sequence[str], room: float) -> list[_Head]:  # in
+    """Heads of one size: large in one line where all of them fit, else small in several, so that no word is broken
+    that letters of `SMALLEST` keep whole."""
+    letters = room * 72 / LETTER  # of 1 pt
+    if all(len(text) * LETTERS <= letters for text in texts):
+        return [_Head(_plain(text), LETTERS) for text in texts]
+    longest = max((len(word) for text in texts for word in re.split(r"(?<=-)|\s", text)), default=1)
+    size = min(SMALL, max(letters / max(longest, 1), SMALLEST))
+    return [_Head(_plain(fill(text, max(int(letters / size + 1e-9), 8))), size) for text in texts]
 
 
 def _plain(text: str) -> str:

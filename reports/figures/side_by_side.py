@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -21,6 +22,7 @@ from ihbench.record.schema import score_lines
 from ihbench.record.store import RunFolder
 from ihbench.runner.score_stage import render_path
 from ihbench.scene.contracts import MaskState, TestView, TrainView
+from ihbench.scene.method_spec import method_spec
 from ihbench.scene.spread import spread
 from ihbench.scene.views import OccludedScene
 from ihbench.scoring.contact_sheet import GREY, common_window, error_image, with_occluder
@@ -49,7 +51,7 @@ def visual(runs: Sequence[FinishedRun], views: int) -> PictureSheet:
             ]
             rows.append((f"{scene.name}, {loaded.key.name}", panels))
     caption = f"Held-out test views of {table.people} under {table.conditions}. {table.note}"
-    return PictureSheet((INPUT, TRUTH, *table.labels), rows, caption)
+    return PictureSheet((INPUT, TRUTH, *map(table.head, table.labels)), rows, caption)
 
 
 def ablation(runs: Sequence[FinishedRun], views: int) -> PictureSheet:
@@ -192,6 +194,14 @@ class Table:
                     own[label] = folders[of_scene[0].folder], of_scene[0]
                     self.shown.add(of_scene[0].seed)
             self.scenes.append(_Scene(scene, own))
+
+    def head(self, label: str) -> str:
+        """The label with the method as its paper writes it, where the bench knows it."""
+        for result in self.results:
+            if label == result.method or label.startswith(f"{result.method} ("):
+                with suppress(BadInput):
+                    return method_spec(result.method).title + label[len(result.method) :]
+        return label
 
     @property
     def people(self) -> str:

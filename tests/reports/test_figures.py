@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from ihbench.document.picture_sheet import Panel, PictureSheet
+from ihbench.document.picture_sheet import LETTERS, Panel, PictureSheet, _heads
 from ihbench.errors import BadInput
 from ihbench.files.images import read_image
 from ihbench.methods.inpainthuman.avatar.avatar import GaussianAvatar
@@ -58,6 +58,15 @@ def test_long_heads_take_lines_instead_of_running_into_each_other():
     assert height(long) > height("short") + 60
 
 
+def test_heads_of_columns_have_one_size_and_whole_words():
+    names = ("training input image", "GaussianAvatar", "3DGS-Avatar", "GTU")
+    heads = _heads(names, 0.55)
+    assert len({head.size for head in heads}) == 1
+    assert [head.text for head in heads] == ["training input\nimage", "GaussianAvatar", "3DGS-Avatar", "GTU"]
+    assert {head.size for head in _heads(("a", "b"), 0.55)} == {LETTERS}
+    assert "".join(_heads(["a_name_of_very_many_letters" * 3], 0.55)[0].text.split()).count("letters") == 3
+
+
 @pytest.mark.parametrize("rows", [[], [("row", [Panel(plain(4, 4))])]])
 def test_a_sheet_of_other_rows_than_columns_is_refused(rows):
     with pytest.raises(ValueError, match="row"):
@@ -72,7 +81,9 @@ def test_a_panel_is_a_picture():
 def test_visual_shows_the_renders_with_the_numbers_of_the_record(bench, finished):
     with bench.in_its_world():
         sheet = visual([FinishedRun(finished.folder)], views=2)
-    assert sheet.columns == ("training input", "ground truth", finished_label(finished))
+    label = finished_label(finished)
+    assert label.startswith("inpainthuman")
+    assert sheet.columns == ("training input", "ground truth", "InpaintHuman" + label.removeprefix("inpainthuman"))
     assert len(sheet.rows) == 2
     known = {
         (str(line.camera), line.frame): next(
