@@ -8,11 +8,14 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.resources import files
 from typing import Any
 
 from ihbench.document import document
+from ihbench.errors import BadInput
+from ihbench.scene.method_spec import method_spec
 
 ABSENT = "--"  # as the paper prints it
 
@@ -97,8 +100,12 @@ class PaperRow:
     source: str = ""  # of a row that another publication prints
 
     def is_of(self, method: str) -> bool:
-        """Whether this is the row of a registered method: "3DGS-Avatar" is `3dgsavatar` or `3dgs_avatar`."""
-        return _letters(self.name) == _letters(method)
+        """Whether this is the row of a method, by its name or its title: "3DGS-Avatar" is `3dgs_avatar`, and what
+        registers itself as `three-dgs-avatar` under that title."""
+        names = {method}
+        with suppress(BadInput):
+            names.add(method_spec(method).title)
+        return _letters(self.name) in map(_letters, names)
 
     @property
     def own(self) -> bool:

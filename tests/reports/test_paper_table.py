@@ -7,7 +7,7 @@ import math
 import pytest
 
 from ihbench.document.document import spans
-from ihbench.reports.paper.paper_numbers import paper_table
+from ihbench.reports.paper.paper_numbers import PaperRow, paper_table
 from ihbench.reports.paper.paper_table import build_frame
 from ihbench.scene.plan import Omission
 from tests.reports.fake_runs import LPIPS, PSNR, SUBJECTS, fake_run
@@ -228,3 +228,11 @@ def test_components_are_told_from_the_switches():
 def test_what_the_plan_left_out_is_not_there():
     left_out = (Omission("one_fit", True, "nothing hidden"),)
     assert ablated(switches(), left_out=left_out) == {"MS Maps": "✓", "TI": "", "SG": "", "inpainting": ""}
+
+
+@pytest.mark.parametrize("method", ["three-dgs-avatar", "3dgs_avatar", "3DGS-Avatar"])
+def test_a_row_of_the_paper_knows_its_method_by_name_and_by_title(method):
+    row = PaperRow("3DGS-Avatar", ())
+    assert row.is_of(method)
+    assert not row.is_of("gaussianavatar")
+    assert not row.is_of("somebody-elses")
