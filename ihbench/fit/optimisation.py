@@ -22,8 +22,9 @@ from ihbench.clock.checkpoints import Tensors, Words
 from ihbench.clock.events import Resumed, RolledBack
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.errors import BadInput, Diverged
-from ihbench.scene.contracts import MaskState, TrainingSet
+from ihbench.errors import Diverged
+from ihbench.fit.visible_person import require_visible_person
+from ihbench.scene.contracts import TrainingSet
 
 GOOD_EVERY = 25  # steps between two copies to go back to
 SMALLER = 0.1  # share that is left of the step sizes after going back
@@ -122,7 +123,7 @@ class Optimisation(ABC, Generic[Module]):
         Raises `Diverged` with the first bad step where going back does not help: at the first step of all, for a view
         whose own values are bad, and after `MOST_ROLL_BACKS`. `BadInput` when no view shows the person.
         """
-        self._require_visible_pixels()
+        require_visible_person(self.training)
         self._restore()
         started_at = self.step
         with progress.task(self.title, self.steps) as task, self._freezing():
@@ -157,13 +158,6 @@ class Optimisation(ABC, Generic[Module]):
         finally:
             for p in self._frozen:
                 p.requires_grad_(True)
-
-    def _require_visible_pixels(self) -> None:
-        shows = any((view.mask == MaskState.PERSON).any() for view in self.training.views)
-        if not shows:
-            raise BadInput(
-                f"scene {self.training.name}: no training view shows a visible person pixel; nothing to fit"
-            )
 
     def _view_of(self, step: int, n: int) -> int:
         """Every view once an epoch, in an order that depends on seed and epoch alone, so a resumed run repeats it."""

@@ -14,7 +14,14 @@ from ihbench.clock.ledger import Ledger
 from ihbench.errors import BadInput
 from ihbench.scene.contracts import MaskState, TrainingSet, TrainView
 from ihbench.stress.case import Answer, Case, Unit, words_of
-from ihbench.stress.six_views import all_unknown, training_set, views, with_bad_hidden_pixels, with_bad_pixel
+from ihbench.stress.six_views import (
+    all_unknown,
+    training_set,
+    views,
+    with_bad_hidden_pixels,
+    with_bad_pixel,
+    with_other_shapes,
+)
 from ihbench.stress.training import story_of_fit
 
 Config = Any  # of a method: a frozen dataclass
@@ -22,6 +29,7 @@ Config = Any  # of a method: a frozen dataclass
 HELPS = "the error of alpha over the views after the fit, over that before: a fit that does not lower it is none"
 STEP = "a step is counted"
 PRUNED = "an opacity of 1 is asked of every Gaussian"
+OTHER_SHAPES = "shape coefficients that differ by frame"
 REFUSED = "it must be refused, and the line must say this"
 
 
@@ -87,18 +95,6 @@ class FitCases:
     def helps(self, name: str, what: str, function: Callable[[], Answer]) -> Case:
         return self.case(name, what, function, "at most", HELPS)
 
-    def other_shapes(self) -> Case:
-        """Shape coefficients that differ by frame: one avatar, with their mean."""
-
-        def ratio() -> Answer:
-            shown = [
-                replace(view, body_pose=replace(view.body_pose, betas=np.array([0.5 * (-1) ** k, 0.0])))
-                for k, view in enumerate(views())
-            ]
-            return self.ratio(self.tiny, training_set(shown))
-
-        return self.helps("other-shapes", "shape coefficients that differ by frame", ratio)
-
     def ignoring(self) -> list[Case]:
         """Of a method that takes hidden pixels for background unless it is told to ignore them: when it is."""
         config, how = replace(self.tiny, unknown="ignore"), "hidden pixels are ignored"
@@ -147,6 +143,7 @@ class FitCases:
                 )
                 for factor in factors
             ),
+            self.helps("other-shapes", OTHER_SHAPES, lambda: self.ratio(self.tiny, with_other_shapes())),
             self.helps("one-frame", "one training frame", lambda: self.ratio(self.tiny, training_set(views()[:1]))),
             self.helps("empty-mask", "two frames without a visible pixel", lambda: self.empty_masks(unseen)),
             self.case("no-view", "no training view", lambda: self.nothing([]), *refused),

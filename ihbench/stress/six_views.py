@@ -53,6 +53,13 @@ def all_unknown() -> list[TrainView]:
     return [replace(view, mask=np.full_like(view.mask, MaskState.UNKNOWN)) for view in views()]
 
 
+def with_other_shapes() -> TrainingSet:
+    """Shape coefficients differ by frame."""
+    betas = [np.array([0.5 * (-1) ** k, 0.0]) for k in range(len(views()))]
+    poses = [replace(view.body_pose, betas=own) for view, own in zip(views(), betas, strict=True)]
+    return training_set([replace(view, body_pose=pose) for view, pose in zip(views(), poses, strict=True)])
+
+
 def with_bad_pixel(k: int, value: float) -> TrainingSet:
     """One person pixel of view k has this value."""
     image = views()[k].image.astype(np.float32)

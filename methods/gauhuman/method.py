@@ -7,7 +7,7 @@ from pathlib import Path
 from ihbench.body import Body
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.errors import BadInput
+from ihbench.fit.visible_person import require_visible_person
 from ihbench.methods.gauhuman.avatar import GauHumanAvatar
 from ihbench.methods.gauhuman.config import GauHumanConfig
 from ihbench.methods.gauhuman.fitting import GauHumanFit
@@ -25,8 +25,7 @@ class GauHuman:
     ) -> GauHumanAvatar:
         """Fit one person. See `scene.contracts.Method`. Raises `BadInput` without a view that shows the person, and
         `Diverged` also where density control would leave no Gaussian."""
-        if not len(training.views):
-            raise BadInput(f"scene {training.name}: no training view; nothing to fit")
+        require_visible_person(training)
         with ledger.stage("fit/prepare"):
             avatar = GauHumanAvatar(self.config, training.body, seed).to(device)
             fit = GauHumanFit(avatar, training, seed, ledger)

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from ihbench.body import Body
-from ihbench.clock.events import Warned
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.errors import BadInput
+from ihbench.fit.mean_betas import mean_betas
+from ihbench.fit.visible_person import require_visible_person
 from ihbench.methods.gaussianavatar.avatar import TexelAvatar
 from ihbench.methods.gaussianavatar.config import GaussianAvatarConfig
 from ihbench.methods.gaussianavatar.stages import PoseStage, Stage1
 from ihbench.scene.contracts import TrainingSet
-
-SAME_BETAS = 1e-3  # a shape coefficient that varies less over the frames is the same
 
 
 class GaussianAvatar:
@@ -29,13 +25,10 @@ class GaussianAvatar:
         self, training: TrainingSet, *, device: str, seed: int, ledger: Ledger, progress: Progress
     ) -> TexelAvatar:
         """Fit one person. See `scene.contracts.Method`. Raises `BadInput` without a view that shows the person."""
-        if not len(training.views):
-            raise BadInput(f"scene {training.name}: no training view; nothing to fit")
+        require_visible_person(training)
         with ledger.stage("fit/prepare"):
-            betas = np.array([view.body_pose.betas for view in training.views])
-            if np.ptp(betas, axis=0).max(initial=0) > SAME_BETAS:
-                ledger.event_once(Warned("shape coefficients vary over the frames; the avatar has their mean"))
-            avatar = TexelAvatar(self.config, training.body, betas.mean(0), seed).to(device)
+            betas = mean_betas(training.views, ledger, "the avatar")
+            avatar = TexelAvatar(self.config, training.body, betas, seed).to(device)
         with ledger.stage("fit/stage1"):
             stage1 = Stage1(avatar, training, seed, ledger)
             stage1.run(progress)

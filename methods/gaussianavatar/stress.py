@@ -28,6 +28,7 @@ from ihbench.stress.six_views import (
     views,
     with_bad_hidden_pixels,
     with_bad_pixel,
+    with_other_shapes,
 )
 from ihbench.stress.training import story_of_fit
 
@@ -132,6 +133,7 @@ CASES = [
     _training("rate-100", "step sizes × 100", lambda: _ratio(scaled_rates(100.0)), "at most", 1e-3, NO_WORSE),
     _step("rate-1e30", "step sizes × 1e30", _absurd_rates),
     _helps("one-frame", "one training frame", lambda: _ratio(TINY, training_set(views()[:1]))),
+    _helps("other-shapes", "shape coefficients that differ by frame", lambda: _ratio(TINY, with_other_shapes())),
     _helps("one-frame-batch", "one training frame, batches of two",
            lambda: _ratio(replace(TINY, batch=2), training_set(views()[:1]))),
     _refused("no-view", "no training view", lambda: _nothing(training_set([]))),

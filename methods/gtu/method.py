@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from ihbench.body import Body
 from ihbench.clock.events import LossCurve
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.errors import BadInput
+from ihbench.fit.mean_betas import mean_betas
+from ihbench.fit.visible_person import require_visible_person
 from ihbench.methods.gtu.avatar import GtuAvatar
 from ihbench.methods.gtu.config import GtuConfig
 from ihbench.methods.gtu.fitting import GtuFit
-from ihbench.scene.contracts import MaskState, TrainingSet
+from ihbench.scene.contracts import TrainingSet
 
 SWITCHES = "--method."  # what those of the backbone begin with
 
@@ -29,14 +28,12 @@ class Gtu:
         """Fit one person. See `scene.contracts.Method`. Raises `BadInput` without a view that shows the person, and
         for weights that are missing or wrong."""
         views, config = training.views, self.config
-        if not any((view.mask == MaskState.PERSON).any() for view in views):
-            why = "no training view shows a visible person pixel" if len(views) else "no training view"
-            raise BadInput(f"scene {training.name}: {why}; nothing to fit")
+        require_visible_person(training)
         with ledger.stage("fit/prepare"):
             if config.guesses:
                 self._look_at_backbone()
             poses = [view.body_pose for view in views]
-            betas = np.mean([pose.betas for pose in poses], axis=0)
+            betas = mean_betas(views, ledger, "the avatar")
             avatar = GtuAvatar(config, training.body, betas, [pose.pose for pose in poses]).to(device)
         guesser = None
         if config.guesses:

@@ -7,8 +7,8 @@ from pathlib import Path
 from ihbench.body import Body
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.errors import BadInput
 from ihbench.fit.mean_betas import mean_betas
+from ihbench.fit.visible_person import require_visible_person
 from ihbench.methods.humannerf.avatar import HumanNerfAvatar
 from ihbench.methods.humannerf.config import HumanNerfConfig
 from ihbench.methods.humannerf.fitting import HumanNerfFit
@@ -26,8 +26,7 @@ class HumanNerfMethod:
     ) -> HumanNerfAvatar:
         """Fit one person. See `scene.contracts.Method`. Raises `BadInput` without a view that shows the person, and
         `Diverged` also where every start ends in an empty picture."""
-        if not len(training.views):
-            raise BadInput(f"scene {training.name}: no training view; nothing to fit")
+        require_visible_person(training)
         with ledger.stage("fit/prepare"):
             betas = mean_betas(training.views, ledger, "the T-pose")
             avatar = HumanNerfAvatar(self.config, training.body, betas, seed).to(device)

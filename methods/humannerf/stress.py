@@ -1,5 +1,5 @@
 """Stiff training of HumanNeRF: what is asked of every such fit (`stress.fit_cases`), both ways to take hidden pixels,
-shapes that differ by frame, fits that stay empty, and a kill. Named in the spec."""
+fits that stay empty, and a kill. Named in the spec."""
 
 from __future__ import annotations
 
@@ -67,7 +67,6 @@ OURS = FitCases("humannerf", TINY, RATES, fit, start)
 CASES = [
     *OURS.usual(TINY, TINY, None),
     *OURS.ignoring(),
-    OURS.other_shapes(),
     OURS.case("empty", "everything is background", _empty, "words", STEP),
     OURS.resumed(stage),
 ]  # fmt: skip

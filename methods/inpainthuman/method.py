@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from ihbench.body import Body
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.errors import BadInput
+from ihbench.fit.mean_betas import mean_betas
 from ihbench.fit.precision import DTYPES, Computed, choose
+from ihbench.fit.visible_person import require_visible_person
 from ihbench.methods.inpainthuman.avatar.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.config import InpaintHumanConfig
 from ihbench.methods.inpainthuman.stages.stage1 import Stage1
@@ -28,8 +28,7 @@ class InpaintHuman:
         self, training: TrainingSet, *, device: str, seed: int, ledger: Ledger, progress: Progress
     ) -> GaussianAvatar:
         """Fit one person. See `scene.contracts.Method`. Raises `BadInput` without a view that shows the person."""
-        if not len(training.views):
-            raise BadInput(f"scene {training.name}: no training view; nothing to fit")
+        require_visible_person(training)
         inpaint = self.config.inpaint
         with ledger.stage("fit/prepare"):
             if self.config.paints and inpaint.uses_diffusion and inpaint.names_something:
@@ -40,7 +39,7 @@ class InpaintHuman:
                 from ihbench.diffusion.complete_silhouette import check_sam
 
                 check_sam(inpaint.sam_weights)
-            betas = np.mean([view.body_pose.betas for view in training.views], axis=0)
+            betas = mean_betas(training.views, ledger, "the avatar")
             avatar = GaussianAvatar(self.config, training.body, betas, seed).to(device)
             avatar.fit_dtype = self._precision(device, ledger)
         with ledger.stage("fit/stage1"):

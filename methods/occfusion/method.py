@@ -10,7 +10,7 @@ from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.diffusion.backbone import Backbone
 from ihbench.diffusion.backbone_choice import load_chosen, look_at_chosen
-from ihbench.errors import BadInput
+from ihbench.fit.visible_person import require_visible_person
 from ihbench.methods.occfusion.alpha_score import AlphaScore
 from ihbench.methods.occfusion.avatar import OccFusionAvatar
 from ihbench.methods.occfusion.complete_masks import complete_masks
@@ -32,8 +32,7 @@ class OccFusion:
     ) -> OccFusionAvatar:
         """Fit one person. See `scene.contracts.Method`. Raises `BadInput` without a view that shows the person and
         for weights that are missing, and `Diverged` also where density control would leave no Gaussian."""
-        if not len(training.views):
-            raise BadInput(f"scene {training.name}: no training view; nothing to fit")
+        require_visible_person(training)
         config = self.config
         with ledger.stage("fit/prepare"):
             avatar = OccFusionAvatar(config, training.body, seed).to(device)

@@ -7,7 +7,7 @@ from pathlib import Path
 from ihbench.body import Body
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.errors import BadInput
+from ihbench.fit.visible_person import require_visible_person
 from ihbench.methods.occgaussian.avatar import OccGaussianAvatar
 from ihbench.methods.occgaussian.config import OccGaussianConfig
 from ihbench.methods.occgaussian.fitting import OccGaussianFit
@@ -26,8 +26,7 @@ class OccGaussian:
     ) -> OccGaussianAvatar:
         """Fit one person. See `scene.contracts.Method`. Raises `BadInput` without a view that shows the person, and
         `Diverged` also where density control would leave no Gaussian."""
-        if not len(training.views):
-            raise BadInput(f"scene {training.name}: no training view; nothing to fit")
+        require_visible_person(training)
         with ledger.stage("fit/prepare"):
             avatar = OccGaussianAvatar(self.config, training.body, seed).to(device)
         with ledger.stage("fit/sightings"):

@@ -7,8 +7,8 @@ from pathlib import Path
 from ihbench.body import Body
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.errors import BadInput
 from ihbench.fit.mean_betas import mean_betas
+from ihbench.fit.visible_person import require_visible_person
 from ihbench.methods.occnerf.avatar import OccNerfAvatar
 from ihbench.methods.occnerf.config import OccNerfConfig
 from ihbench.methods.occnerf.fitting import OccNerfFit
@@ -25,8 +25,7 @@ class OccNerf:
         self, training: TrainingSet, *, device: str, seed: int, ledger: Ledger, progress: Progress
     ) -> OccNerfAvatar:
         """Fit one person. See `scene.contracts.Method`. Raises `BadInput` without a view that shows the person."""
-        if not len(training.views):
-            raise BadInput(f"scene {training.name}: no training view; nothing to fit")
+        require_visible_person(training)
         with ledger.stage("fit/prepare"):
             betas = mean_betas(training.views, ledger, "the T-pose")
             avatar = OccNerfAvatar(self.config, training.body, betas, seed).to(device)

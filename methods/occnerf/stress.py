@@ -1,5 +1,5 @@
 """Stiff training of OccNeRF: what is asked of every such fit (`stress.fit_cases`), both ways to take hidden pixels,
-a person in one pixel, shapes that differ by frame, an infinite prior, and a kill. Named in the spec."""
+a person in one pixel, an infinite prior, and a kill. Named in the spec."""
 
 from __future__ import annotations
 
@@ -65,7 +65,6 @@ CASES = [
     *OURS.ignoring(),
     OURS.helps("released-prior", "the completeness prior as released",
                lambda: OURS.ratio(replace(TINY, completeness="released"))),
-    OURS.other_shapes(),
     OURS.case("one-pixel", "one person pixel a view", _one_pixel, "words", STEP),
     OURS.case("huge-prior", "a completeness prior a million times as heavy", _huge_prior, "words", STEP),
     OURS.resumed(stage, config=replace(TINY, inside=8)),

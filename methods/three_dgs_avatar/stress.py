@@ -1,5 +1,5 @@
 """Stiff training of 3DGS-Avatar: what is asked of every such fit (`stress.fit_cases`), both ways to take hidden
-pixels, a single Gaussian, shapes that differ by frame, and a kill. Named in the spec."""
+pixels, a single Gaussian, and a kill. Named in the spec."""
 
 from __future__ import annotations
 
@@ -65,7 +65,6 @@ OURS = FitCases("three-dgs-avatar", TINY, RATES, fit, start)
 CASES = [
     *OURS.usual(TINY, TINY, replace(TINY, density=replace(TINY.density, faint=1.0))),
     *OURS.ignoring(),
-    OURS.other_shapes(),
     OURS.case("one-gaussian", "a single Gaussian", _one_gaussian, "words", STEP),
     OURS.resumed(stage),
 ]  # fmt: skip

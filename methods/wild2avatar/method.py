@@ -7,9 +7,9 @@ from pathlib import Path
 from ihbench.body import Body
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.errors import BadInput
 from ihbench.fit.mean_betas import mean_betas
 from ihbench.fit.training_poses import TrainingPoses
+from ihbench.fit.visible_person import require_visible_person
 from ihbench.methods.wild2avatar.avatar import Wild2AvatarAvatar
 from ihbench.methods.wild2avatar.config import Wild2AvatarConfig
 from ihbench.methods.wild2avatar.fitting import Wild2AvatarFit
@@ -27,8 +27,7 @@ class Wild2Avatar:
     ) -> Wild2AvatarAvatar:
         """Fit one person. See `scene.contracts.Method`. Raises `BadInput` without a view that shows the person, and
         `Diverged`."""
-        if not len(training.views):
-            raise BadInput(f"scene {training.name}: no training view; nothing to fit")
+        require_visible_person(training)
         with ledger.stage("fit/prepare"):
             betas = mean_betas(training.views, ledger, "the avatar")
             poses = TrainingPoses.of(training.views)

@@ -1,5 +1,5 @@
-"""Stiff training of Wild2Avatar: what is asked of every such fit (`stress.fit_cases`), rays that see nothing, shapes
-that differ by frame, a person whose surface has vanished, and a kill. Named in the spec."""
+"""Stiff training of Wild2Avatar: what is asked of every such fit (`stress.fit_cases`), rays that see nothing, a
+person whose surface has vanished, and a kill. Named in the spec."""
 
 from __future__ import annotations
 
@@ -85,7 +85,6 @@ def stage(avatar: Any, training: TrainingSet, ledger: Ledger) -> Any:
 OURS = FitCases("wild2avatar", TINY, RATES, fit, begun)
 CASES = [
     *OURS.usual(TINY, replace(TINY, steps=45), None),
-    OURS.other_shapes(),
     OURS.case("vanished", "a surface that is nowhere", _vanished, "words", "an empty picture is a picture"),
     OURS.resumed(stage, fresh=start),
 ]

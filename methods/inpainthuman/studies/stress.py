@@ -34,6 +34,7 @@ from ihbench.stress.six_views import (
     views,
     with_bad_hidden_pixels,
     with_bad_pixel,
+    with_other_shapes,
     with_view,
 )
 from ihbench.stress.training import story_of_fit
@@ -348,6 +349,7 @@ CASES = [
            lambda: _ratio(TINY, with_view(2, body_pose=views()[5].body_pose))),
     _helps("one-frame", "one training frame", lambda: _ratio(TINY, training_set(views()[:1]))),
     _helps("two-frames", "two training frames", lambda: _ratio(TINY, training_set(views()[:2]))),
+    _helps("other-shapes", "shape coefficients that differ by frame", lambda: _ratio(TINY, with_other_shapes())),
     _helps("one-pixel", "one visible pixel in all",
            lambda: _ratio(TINY, training_set([only_a_pixel(0, MaskState.UNKNOWN)]))),
     _step("speck", "a view of one person pixel on known background", _speck),
