@@ -9,7 +9,6 @@ import pytest
 
 from ihbench.body import texel_table
 from ihbench.clock.progress import Progress
-from ihbench.clock.threads import one_torch_thread
 from ihbench.diffusion.crops.part_map import smpl_parts
 from ihbench.diffusion.inpaint_config import Filler
 from ihbench.errors import BadInput
@@ -52,12 +51,6 @@ def fill(filler, views):
 
 def eight_bit(rgb):
     return np.round(255 * np.array(rgb)).astype(np.uint8)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def single_thread():
-    with one_torch_thread():
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,6 @@ import torch
 from ihbench.body.canonical import canonical_pose
 from ihbench.body.pose import BodyPose
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
-from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput
 from ihbench.export.splat_cloud import splat_cloud
 from ihbench.fit.big_pose.deformation import Deformation, inverse
@@ -25,12 +24,6 @@ from .tiny_gaussians import an_avatar
 
 BODY = the_body()
 BETAS = np.array([0.6, -0.8, 0.3, 0, 0.5, 0, 0, 0, 0, 0])
-
-
-@pytest.fixture(scope="module", autouse=True)
-def single_thread():
-    with one_torch_thread():
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from ihbench.clock.threads import one_torch_thread
 from ihbench.diffusion.score_distillation import Prompts, ScoreDistillation
 from ihbench.errors import BadInput
 from ihbench.fit.gaussians.adam import GaussianAdam, Rate
@@ -32,12 +31,6 @@ from .tiny_fit import training_set, training_views
 from .tiny_gtu import an_avatar
 
 BODY = the_body()
-
-
-@pytest.fixture(scope="module", autouse=True)
-def single_thread():
-    with one_torch_thread():
-        yield
 
 
 # ------------------------------------------------------------------------------------------- checks 1 to 5: losses

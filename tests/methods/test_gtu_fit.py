@@ -8,7 +8,6 @@ import torch
 
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput, Diverged
 from ihbench.methods.gtu.avatar import NONE, VERTEX, GtuAvatar
 from ihbench.methods.gtu.fitting import pruning_alone
@@ -22,18 +21,12 @@ from tests.bench.fake_capture import a_camera, a_pose, the_body, train_view
 from tests.diffusion.sd2_miniature import make_miniature
 from tests.diffusion.tiny_diffusion import same, tiny_backbone, weights
 
-from .tiny_fit import SIZE, STRIP, equal_bits, training_set, training_views
+from .tiny_fit import SIZE, STRIP, equal_bits, everything, training_set, training_views
 from .tiny_gaussians import Killed, SavesAt, events, killed_after
 from .tiny_gtu import TINY, a_fit, cropped, fitted
 
 BODY = the_body()
 QUIET = Progress.silent()
-
-
-@pytest.fixture(scope="module", autouse=True)
-def single_thread():
-    with one_torch_thread():
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -54,10 +47,6 @@ def whole():
     fit._hold = noted
     fit.run(QUIET)
     return fit.avatar, ledger, places
-
-
-def everything(avatar):
-    return {name: value.detach().clone() for name, value in avatar.state_dict().items()}
 
 
 # ------------------------------------------------------------------------------------------- check 8, over a fit
@@ -298,13 +287,6 @@ def test_what_was_saved_renders_the_same(whole, tmp_path):
 def photos(views, **changes):
     config = replace(TINY, sds=False, steps=4, **changes)
     return Gtu(config).fit(training_set(views), device="cpu", seed=0, ledger=Ledger(), progress=QUIET)
-
-
-def test_nothing_to_fit_is_one_line():
-    hidden = [replace(v, mask=np.full_like(v.mask, MaskState.UNKNOWN)) for v in training_views()]
-    for views in ([], hidden):
-        with pytest.raises(BadInput, match="nothing to fit"):
-            photos(views)
 
 
 def test_frames_without_a_person_and_shapes_that_vary_do_no_harm():

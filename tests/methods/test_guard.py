@@ -10,7 +10,6 @@ import torch
 
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import Diverged
 from ihbench.fit.optimisation import GOOD_EVERY, MOST_ROLL_BACKS, SMALLER
 from ihbench.methods.inpainthuman.stages.stage1 import Stage1, loss_of, prepare_target
@@ -21,12 +20,6 @@ from .tiny_fit import an_avatar, equal_bits, fitted, parameters_of, training_set
 STEPS = GOOD_EVERY + 12
 BAD = GOOD_EVERY + 5
 SMALL = {"texels": 32, "levels": (16,), "pose_residual": False, "steps": STEPS}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def single_thread():
-    with one_torch_thread():
-        yield
 
 
 @pytest.fixture(scope="module")

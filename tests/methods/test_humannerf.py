@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from ihbench.clock.events import Warned
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput, Diverged
 from ihbench.fit.rays.patch_loss import patch_distance
 from ihbench.methods.humannerf.avatar import HumanNerfAvatar
@@ -23,22 +21,11 @@ from ihbench.scene.method_spec import method_spec
 from ihbench.stress.run import run_cases
 from tests.bench.fake_capture import a_camera, a_pose, the_body, train_view
 
-from .tiny_fit import SIZE, STRIP, equal_bits, training_set, training_views
+from .tiny_fit import SIZE, STRIP, equal_bits, everything, training_set, training_views
 from .tiny_gaussians import SavesAt, events, killed_after
 
 BODY = the_body()
 SMALL = replace(TINY, steps=6, kick_in=2, full_band=5, patch_px=24, guard=(), squared_first=0)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def single_thread():
-    with one_torch_thread():
-        yield
-
-
-@pytest.fixture(scope="module")
-def views():
-    return training_views()
 
 
 def a_fit(training, seed=0, ledger=None, **changes):
@@ -50,10 +37,6 @@ def fitted(training, seed=0, ledger=None, **changes):
     fit = a_fit(training, seed, ledger, **changes)
     fit.run(Progress.silent())
     return fit.avatar
-
-
-def everything(avatar):
-    return {name: value.detach().clone() for name, value in avatar.state_dict().items()}
 
 
 @cache
@@ -271,29 +254,6 @@ def test_an_avatar_on_disk_draws_the_same(tmp_path):
     (tmp_path / "avatar.json").write_text("{}")
     with pytest.raises(BadInput, match="expected 'humannerf'"):
         HumanNerfMethod(SMALL).load(tmp_path, BODY)
-
-
-# ------------------------------------------------------------------------------------------------------- bad input
-
-
-def test_what_cannot_be_fitted_is_said_in_a_line(views):
-    def fit(training, ledger=None):
-        return HumanNerfMethod(replace(SMALL, steps=1)).fit(
-            training, device="cpu", seed=0, ledger=ledger or Ledger(), progress=Progress.silent()
-        )
-
-    with pytest.raises(BadInput, match="no training view; nothing to fit"):
-        fit(training_set([]))
-    nobody = [replace(view, mask=np.full_like(view.mask, MaskState.UNKNOWN)) for view in views]
-    with pytest.raises(BadInput, match="no training view shows a visible person pixel; nothing to fit"):
-        fit(training_set(nobody))
-    ledger = Ledger()
-    others = [
-        replace(view, body_pose=replace(view.body_pose, betas=np.array([0.3 * k, 0.0])))
-        for k, view in enumerate(views)
-    ]
-    fit(training_set(others), ledger)
-    assert events(ledger, Warned.kind)
 
 
 def test_profiles_and_what_a_scene_does_not_need():

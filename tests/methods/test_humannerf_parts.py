@@ -11,7 +11,6 @@ from torch import Tensor, nn
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
 from ihbench.clock.ledger import Ledger
-from ihbench.clock.threads import one_torch_thread
 from ihbench.fit.rays.ray_target import PosedBox
 from ihbench.methods.humannerf import kernel
 from ihbench.methods.humannerf.avatar import HumanNerfAvatar, PosedField
@@ -33,12 +32,6 @@ from .tiny_fit import SIZE, training_set, training_views
 
 BODY = the_body()
 T_POSE = BodyPose(np.zeros((24, 3)), np.zeros(10), np.zeros(3))
-
-
-@pytest.fixture(scope="module", autouse=True)
-def single_thread():
-    with one_torch_thread():
-        yield
 
 
 def an_avatar(seed=0, **changes):

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from ihbench.body import CANONICAL_POSES, canonical_pose
 from ihbench.body.pose import BodyPose
 from ihbench.camera import Camera
-from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput
 from ihbench.fit.decoded_cache import DECODED_KEPT
 from ihbench.methods.inpainthuman.avatar.avatar import GaussianAvatar
@@ -27,12 +26,6 @@ from .tiny_fit import SIZE, TINY, an_avatar, equal_bits, parameters_of, random_p
 
 BODY = the_body()
 BETAS = np.random.default_rng(5).normal(0, 1, 10)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def single_thread():
-    with one_torch_thread():
-        yield
 
 
 def posed(avatar, body_pose, offset=None):

@@ -15,7 +15,6 @@ from scipy.ndimage import distance_transform_edt
 
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.clock.threads import one_torch_thread
 from ihbench.diffusion.mini.weights import load_mini
 from ihbench.diffusion.score_distillation import falling_timestep
 from ihbench.errors import BadInput, Diverged
@@ -48,7 +47,7 @@ from tests.bench.fake_capture import WHITE, a_camera, a_pose, the_body, train_vi
 from tests.diffusion.sd2_miniature import make_miniature
 from tests.diffusion.tiny_diffusion import tiny_backbone
 
-from .tiny_fit import SIZE, STRIP, equal_bits, training_set, training_views
+from .tiny_fit import SIZE, STRIP, equal_bits, everything, training_set
 
 BODY = the_body()
 TINY = replace(
@@ -64,20 +63,9 @@ TINY = replace(
 ALONE = replace(TINY.refine, steps=0)  # stage 1 without what follows
 
 
-@pytest.fixture(scope="module", autouse=True)
-def single_thread():
-    with one_torch_thread():
-        yield
-
-
 @pytest.fixture(scope="module")
 def backbone():
     return tiny_backbone()
-
-
-@pytest.fixture(scope="module")
-def views():
-    return training_views()
 
 
 @pytest.fixture
@@ -94,10 +82,6 @@ def fitted(training: TrainingSet, ledger: Ledger | None = None, seed: int = 0, *
 
 def an_avatar(**changes: Any) -> OccFusionAvatar:
     return OccFusionAvatar(replace(TINY, **changes), BODY, 0)
-
-
-def everything(avatar: OccFusionAvatar) -> dict[str, torch.Tensor]:
-    return {name: value.detach().clone() for name, value in avatar.state_dict().items()}
 
 
 def events(ledger: Ledger, kind: str) -> list[Any]:
@@ -572,14 +556,6 @@ def test_another_seed_is_another_avatar(whole, views, small):
 
 
 # --------------------------------------------------------------------------------------------------- bad input
-
-
-def test_no_view_and_no_visible_pixel_are_refused(views):
-    with pytest.raises(BadInput, match="no training view; nothing to fit"):
-        fitted(training_set([]))
-    blank = [replace(view, mask=np.full_like(view.mask, MaskState.UNKNOWN)) for view in views]
-    with pytest.raises(BadInput, match="no training view shows a visible person pixel"):
-        fitted(training_set(blank), inpaint=InpaintConfig(on=False))
 
 
 def test_frames_without_a_person_and_bodies_beside_the_image_do_no_harm(views, small):

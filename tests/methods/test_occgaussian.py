@@ -11,7 +11,6 @@ import torch
 
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput, Diverged
 from ihbench.fit.big_pose.avatar import VERTEX
 from ihbench.fit.gaussians.density_config import DensityConfig
@@ -30,7 +29,7 @@ from ihbench.scene.contracts import MaskState, TrainingSet
 from ihbench.scene.method_spec import method_spec
 from tests.bench.fake_capture import WHITE, a_camera, a_pose, rasterized, the_body, train_view
 
-from .tiny_fit import equal_bits
+from .tiny_fit import equal_bits, everything
 from .tiny_gaussians import SavesAt, events, killed_after
 
 BODY = the_body()
@@ -47,12 +46,6 @@ TINY = replace(
     features=replace(SMOKE.features, channels=(4, 4, 4), size=4, every=5),
     **PLAIN,
 )
-
-
-@pytest.fixture(scope="module", autouse=True)
-def single_thread():
-    with one_torch_thread():
-        yield
 
 
 def two_coloured():
@@ -100,10 +93,6 @@ def fitted(config, training, seed=0, ledger=None):
     fit = a_fit(config, training, seed, ledger)
     fit.run(QUIET)
     return fit.avatar
-
-
-def everything(avatar):
-    return {name: value.detach().clone() for name, value in avatar.state_dict().items()}
 
 
 @pytest.fixture(scope="module")
@@ -453,14 +442,6 @@ def fit_of(views, **changes):
     return OccGaussian(replace(TINY, steps=4, **changes)).fit(
         set_of(views), device="cpu", seed=0, ledger=Ledger(), progress=QUIET
     )
-
-
-def test_nothing_to_fit_is_refused(training):
-    with pytest.raises(BadInput, match="no training view; nothing to fit"):
-        fit_of([])
-    blank = [replace(v, mask=np.full_like(v.mask, MaskState.UNKNOWN)) for v in training.views]
-    with pytest.raises(BadInput, match="no training view shows a visible person pixel"):
-        fit_of(blank)
 
 
 @pytest.mark.parametrize("unknown", ["ignore", "background"])

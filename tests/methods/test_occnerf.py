@@ -9,10 +9,9 @@ import pytest
 import torch
 from torch import nn
 
-from ihbench.clock.events import LeftOut, Warned
+from ihbench.clock.events import LeftOut
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput, Diverged
 from ihbench.fit.rays.marching import MarchedPixels
 from ihbench.fit.rays.ray_target import PosedBox
@@ -35,22 +34,11 @@ from ihbench.scene.method_spec import method_spec
 from ihbench.stress.run import run_cases
 from tests.bench.fake_capture import a_camera, a_pose, the_body
 
-from .tiny_fit import SIZE, equal_bits, training_set, training_views
+from .tiny_fit import SIZE, equal_bits, everything, training_set, training_views
 from .tiny_gaussians import SavesAt, events, killed_after
 
 BODY = the_body()
 SMALL = replace(TINY, steps=10, decay_steps=10, patch_px=12, samples=24, width=16, weight_code=8, weight_channels=16)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def single_thread():
-    with one_torch_thread():
-        yield
-
-
-@pytest.fixture(scope="module")
-def views():
-    return training_views()
 
 
 def an_avatar(seed=0, **changes):
@@ -59,10 +47,6 @@ def an_avatar(seed=0, **changes):
 
 def a_fit(training, seed=0, ledger=None, **changes):
     return OccNerfFit(start(replace(SMALL, **changes), training), training, seed, ledger or Ledger())
-
-
-def everything(avatar):
-    return {name: value.detach().clone() for name, value in avatar.state_dict().items()}
 
 
 @cache
@@ -391,14 +375,6 @@ def fit_of(views, ledger=None, **changes):
     )
 
 
-def test_no_view_and_no_visible_pixel_are_refused(views):
-    with pytest.raises(BadInput, match="no training view; nothing to fit"):
-        fit_of([])
-    blank = [replace(view, mask=np.full_like(view.mask, MaskState.UNKNOWN)) for view in views]
-    with pytest.raises(BadInput, match="no training view shows a visible person pixel"):
-        fit_of(blank)
-
-
 def test_views_without_a_visible_pixel_are_not_drawn(views):
     blank = replace(views[1], mask=np.full_like(views[1].mask, MaskState.UNKNOWN))
     fit = a_fit(training_set([views[0], blank, views[2]]))
@@ -425,15 +401,6 @@ def test_a_nan_pixel_is_a_divergence_and_one_behind_the_occluder_is_nobodys_busi
         some = (replace(views[1], image=image), views[1])
         one, other = (fit_of([view], unknown=unknown, steps=2) for view in some)
         assert equal_bits(everything(one), everything(other))
-
-
-def test_shapes_that_differ_by_frame_become_their_mean_and_are_said(views):
-    betas = [np.array([b, 0.0]) for b in (-1.0, 0.0)]
-    some = [replace(v, body_pose=replace(v.body_pose, betas=b)) for v, b in zip(views[:2], betas, strict=True)]
-    ledger = Ledger()
-    avatar = fit_of(some, ledger, steps=2)
-    assert avatar.betas.tolist() == [-0.5, 0.0]
-    assert any("shape coefficients vary" in event["what"] for event in events(ledger, Warned.kind))
 
 
 # -------------------------------------------------------------------------------------------------------- plan

@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.clock.threads import one_torch_thread
 from ihbench.diffusion.crops.crop_view import cut_view, with_frames
 from ihbench.diffusion.inpaint_config import InpaintConfig
 from ihbench.methods.inpainthuman.inpainting.painted_view import paste_back
@@ -24,12 +22,6 @@ from tests.methods.tiny_fit import SIZE, an_avatar, shaken, training_set, traini
 QUIET = Progress.silent()
 HIDDEN = slice(28, 36)
 SIMPLE = InpaintConfig(filler="mean", key_views=0)
-
-
-@pytest.fixture(autouse=True)
-def threads():
-    with one_torch_thread():
-        yield
 
 
 def one_sided(hidden=HIDDEN):

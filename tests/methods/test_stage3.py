@@ -10,7 +10,6 @@ import torch
 
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput, Diverged
 from ihbench.fit.prior_config import PriorConfig
 from ihbench.methods.inpainthuman.config import PAPER, QUICK
@@ -30,17 +29,11 @@ from ihbench.metrics.ssim import ssim_map
 from ihbench.scene.contracts import MaskState, TrainView
 from tests.bench.fake_capture import WHITE, a_camera, a_pose, train_view
 
-from .tiny_fit import SIZE, STRIP, an_avatar, equal_bits, fitted, parameters_of, shaken, training_set, training_views
+from .tiny_fit import SIZE, STRIP, an_avatar, equal_bits, fitted, parameters_of, shaken, training_set
 
 door = sys.modules["ihbench.metrics.lpips"]  # the package's `lpips` is the function
 REFINE = RefineConfig(steps=10, lpips=0.0)
 BLUE = (0.1, 0.2, 0.9)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def single_thread():
-    with one_torch_thread():
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -56,11 +49,6 @@ def networks(random_trunks, monkeypatch):
     """LPIPS with random trunks, as if their weights were here."""
     monkeypatch.setattr(door, "load", random_trunks.__getitem__)
     return random_trunks
-
-
-@pytest.fixture(scope="module")
-def views():
-    return training_views()
 
 
 @pytest.fixture(scope="module")

@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from ihbench.clock.events import Warned
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.clock.threads import one_torch_thread
-from ihbench.errors import BadInput, Diverged
+from ihbench.errors import Diverged
 from ihbench.fit.gaussians.adam import GaussianAdam, Rate
 from ihbench.fit.gaussians.density import DensityControl
 from ihbench.fit.gaussians.gaussian_set import Gaussians
@@ -25,7 +23,7 @@ from ihbench.scene.contracts import MaskState
 from ihbench.scene.method_spec import method_spec
 from tests.bench.fake_capture import WHITE, a_camera, a_pose, the_body, train_view
 
-from .tiny_fit import SIZE, STRIP, equal_bits, training_set, training_views
+from .tiny_fit import SIZE, STRIP, equal_bits, everything, training_set, training_views
 from .tiny_gaussians import SavesAt, events, killed_after
 
 BODY = the_body()
@@ -41,17 +39,6 @@ SMALL = replace(
 )
 
 
-@pytest.fixture(scope="module", autouse=True)
-def single_thread():
-    with one_torch_thread():
-        yield
-
-
-@pytest.fixture(scope="module")
-def views():
-    return training_views()
-
-
 def a_fit(training, seed=0, ledger=None, **changes):
     avatar = start(replace(SMALL, **changes), training)
     return ThreeDgsAvatarFit(avatar, training, seed, ledger or Ledger())
@@ -61,10 +48,6 @@ def fitted(training, seed=0, ledger=None, **changes):
     fit = a_fit(training, seed, ledger, **changes)
     fit.run(Progress.silent())
     return fit.avatar
-
-
-def everything(avatar):
-    return {name: value.detach().clone() for name, value in avatar.state_dict().items()}
 
 
 @cache
@@ -449,14 +432,6 @@ def fit_of(views, ledger=None, **changes):
     )
 
 
-def test_no_view_and_no_visible_pixel_are_refused(views):
-    with pytest.raises(BadInput, match="no training view; nothing to fit"):
-        fit_of([])
-    blank = [replace(view, mask=np.full_like(view.mask, MaskState.UNKNOWN)) for view in views]
-    with pytest.raises(BadInput, match="no training view shows a visible person pixel"):
-        fit_of(blank)
-
-
 @pytest.mark.parametrize("unknown", ["background", "ignore"])
 def test_frames_without_a_person_and_bodies_beside_the_image_do_not_harm(views, unknown):
     blank = replace(views[1], mask=np.full_like(views[1].mask, MaskState.UNKNOWN))
@@ -491,15 +466,6 @@ def test_pruning_every_gaussian_is_a_divergence(views):
     """No picture of nothing."""
     with pytest.raises(Diverged, match="would prune all of"):
         fit_of(views, density=replace(SMALL.density, faint=1.0, after=1, every=2))
-
-
-def test_shapes_that_differ_by_frame_become_their_mean_and_are_said(views):
-    betas = [np.array([b, 0.0]) for b in (-1.0, 0.0)]
-    some = [replace(v, body_pose=replace(v.body_pose, betas=b)) for v, b in zip(views[:2], betas, strict=True)]
-    ledger = Ledger()
-    avatar = fit_of(some, ledger, steps=4)
-    assert avatar.betas.tolist() == [-0.5, 0.0]
-    assert any("shape coefficients vary" in event["what"] for event in events(ledger, Warned.kind))
 
 
 def test_every_part_can_be_left_out(views):

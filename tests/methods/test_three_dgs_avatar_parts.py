@@ -12,7 +12,6 @@ from torch.nn import functional as F
 from ihbench.body.canonical import canonical_pose
 from ihbench.body.pose import BodyPose
 from ihbench.body.skinning_numpy import axis_angle_to_matrix
-from ihbench.clock.threads import one_torch_thread
 from ihbench.errors import BadInput
 from ihbench.fit.gaussians.neighbours import distance_to, nearest, spacing
 from ihbench.fit.gaussians.skinned_covariance import quaternion_to_matrix
@@ -33,12 +32,6 @@ BODY = the_body()
 PARENTS = [int(p) for p in BODY.parents]
 BETAS = np.array([0.6, -0.8, 0.3, 0, 0.5, 0, 0, 0, 0, 0])
 STAR_POSE = BodyPose(canonical_pose("vitruvian"), BETAS, np.zeros(3))
-
-
-@pytest.fixture(scope="module", autouse=True)
-def single_thread():
-    with one_torch_thread():
-        yield
 
 
 def an_avatar(seed=0, betas=BETAS, frames=3, **changes):

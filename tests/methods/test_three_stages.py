@@ -13,7 +13,6 @@ import torch
 
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.clock.threads import one_torch_thread
 from ihbench.diffusion.mini.weights import save_mini
 from ihbench.diffusion.personalise import ADAPT_STATE, TI_STATE
 from ihbench.errors import BadInput
@@ -29,12 +28,6 @@ from tests.diffusion.tiny_diffusion import tiny_backbone
 from tests.methods.tiny_fit import SIZE, TINY, equal_bits, parameters_of, training_set
 
 QUIET = Progress.silent()
-
-
-@pytest.fixture(autouse=True)
-def threads():
-    with one_torch_thread():
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -181,8 +174,7 @@ class Killed(BaseException):
 def uninterrupted(mini):
     """A configuration, and the parameters that a fit with it ends with."""
     given = config(mini, batch=1)
-    with one_torch_thread():
-        return given, parameters_of(fit(given))
+    return given, parameters_of(fit(given))
 
 
 @pytest.mark.parametrize("state", [TI_STATE, ADAPT_STATE, "stage2-sampled", "stage2-painted", "stage3"])

@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from ihbench.clock.events import Warned
 from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
-from ihbench.clock.threads import one_torch_thread
-from ihbench.errors import BadInput, Diverged
+from ihbench.errors import Diverged
 from ihbench.methods.wild2avatar.config import PAPER, PROFILES, QUICK, leave_out
 from ihbench.methods.wild2avatar.fitting import Wild2AvatarFit
 from ihbench.methods.wild2avatar.method import Wild2Avatar
@@ -22,7 +20,7 @@ from ihbench.stress.run import run_cases
 from tests.bench.fake_capture import WHITE, a_camera, a_pose, the_body
 
 from .box_before_person import CAMERA, RED, SIZE, boxed_set, shots
-from .tiny_fit import equal_bits, training_set, training_views
+from .tiny_fit import equal_bits, everything, training_set, training_views
 from .tiny_gaussians import SavesAt, events, killed_after
 
 BODY = the_body()
@@ -49,25 +47,10 @@ BOXED = replace(
 )
 
 
-@pytest.fixture(scope="module", autouse=True)
-def single_thread():
-    with one_torch_thread():
-        yield
-
-
-@pytest.fixture(scope="module")
-def views():
-    return training_views()
-
-
 def fit_to(training, config, seed=0, ledger=None):
     return Wild2Avatar(config).fit(
         training, device="cpu", seed=seed, ledger=ledger or Ledger(), progress=Progress.silent()
     )
-
-
-def everything(avatar):
-    return {name: value.detach().clone() for name, value in avatar.state_dict().items()}
 
 
 @cache
@@ -400,23 +383,6 @@ def test_the_method_reports_its_stages_and_offers_its_avatar(views):
 
 
 # ------------------------------------------------------------------------------------------------------ bad input
-
-
-def test_shapes_that_vary_by_frame_are_said(views):
-    shown = [
-        replace(view, body_pose=replace(view.body_pose, betas=np.array([0.4 * (-1) ** k, 0.0])))
-        for k, view in enumerate(views)
-    ]
-    ledger = Ledger()
-    avatar = fit_to(training_set(shown), replace(TINY, steps=1), ledger=ledger)
-    assert np.allclose(avatar.betas, 0)
-    assert any("shape coefficients vary" in event["what"] for event in events(ledger, Warned.kind))
-
-
-def test_without_views_or_a_person_there_is_nothing_to_fit(views):
-    for shown in ([], [replace(view, mask=np.full_like(view.mask, MaskState.UNKNOWN)) for view in views]):
-        with pytest.raises(BadInput, match="nothing to fit"):
-            fit_to(training_set(shown), TINY)
 
 
 def test_a_pixel_that_is_not_finite_is_a_divergence(views):

@@ -10,7 +10,6 @@ import torch
 import torch.nn.functional as F
 from scipy.spatial import KDTree
 
-from ihbench.clock.threads import one_torch_thread
 from ihbench.methods.wild2avatar.config import PAPER, QUICK, SMOKE
 from ihbench.methods.wild2avatar.layers import Layer, background_layer, occlusion_layer, together
 from ihbench.methods.wild2avatar.losses import LEAST, Rays, binary_entropy, eikonal, ray_losses
@@ -41,12 +40,6 @@ from tests.bench.fake_capture import a_camera, a_pose, rasterized, the_body, tra
 BODY = the_body()
 SIZE = 48
 COUNTS = SampleCounts(even=24, rounds=0, by_weight=10, extra=4)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def single_thread():
-    with one_torch_thread():
-        yield
 
 
 @cache

@@ -80,5 +80,10 @@ def parameters_of(avatar: GaussianAvatar) -> dict[str, torch.Tensor]:
     return {name: p.detach().clone() for name, p in avatar.named_parameters()}
 
 
+def everything(avatar: torch.nn.Module) -> dict[str, torch.Tensor]:
+    """Its parameters and buffers, copied."""
+    return {name: value.detach().clone() for name, value in avatar.state_dict().items()}
+
+
 def equal_bits(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
