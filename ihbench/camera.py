@@ -26,7 +26,7 @@ class Camera:
     t: Array  # [3] m, world to camera
     width: int
     height: int
-    distortion: Array | None = field(default=None)  # [5] OpenCV k1 k2 p1 p2 k3, or None
+    distortion: Array | None = field(default=None)  # [5] OpenCV k1 k2 p1 p2 k3; None, as of zeros: no lens
 
     def __post_init__(self) -> None:
         """Raises `ValueError` for what is no camera: see `check_intrinsics` and `check_rotation`."""
@@ -40,6 +40,9 @@ class Camera:
                 raise BadValue(
                     f"camera {name}: expected finite values of shape {shape}, got shape {value.shape}{word}"
                 )
+            if name == "distortion" and not value.any():  # of zeros: none
+                object.__setattr__(self, name, None)
+                continue
             value = without_rounding(value) if name == "K" else value
             value.setflags(write=False)
             object.__setattr__(self, name, value)

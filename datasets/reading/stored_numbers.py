@@ -80,6 +80,6 @@ def extrinsic(camera: Camera) -> NDArray[np.float64]:
 def stored_camera(camera: Camera, layout: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """K [3, 3] px with integer pixel centres and E [4, 4] world to camera, m. Raises `ValueError` for a camera with
     distortion, which the layout cannot keep."""
-    if camera.distortion is not None and camera.distortion.any():
+    if camera.distortion is not None:
         raise ValueError(f"{layout} camera: expected a camera without distortion, undistort the images first")
     return camera.K_opencv, extrinsic(camera)

@@ -133,7 +133,7 @@ class OccludedScene:
 
 def straight_camera(camera: Camera, rule: ImageRule) -> Camera:
     """The camera of the protocol's images of this camera."""
-    if rule.undistort and camera.distortion is not None and camera.distortion.any():
+    if rule.undistort and camera.distortion is not None:
         camera = camera.undistorted()
     return camera.scaled(*rule.extent(camera.width, camera.height))
 
@@ -148,7 +148,7 @@ class Undistorter:
         # whole levels: what is known background and what is painted over must not differ by a rounding
         self.background = np.round(np.asarray(rule.background) * 255).astype(np.uint8)  # [3]
         self._maps = None
-        if rule.undistort and camera.distortion is not None and camera.distortion.any():
+        if rule.undistort and camera.distortion is not None:
             K, size = camera.K_opencv, (camera.width, camera.height)
             self._maps = cv2.initUndistortRectifyMap(K, camera.distortion, np.eye(3), K, size, cv2.CV_16SC2)
         self.size = rule.extent(camera.width, camera.height)

@@ -119,6 +119,7 @@ def test_a_short_distortion_is_filled_and_zeros_are_none():
     np.testing.assert_array_equal(lens(LENS[:4]), [*LENS[:4], 0])
     for none in (None, [], np.zeros((1, 5)), np.zeros((14, 1))):
         assert lens(none) is None
+    assert a_camera(np.zeros(5)).distortion is None
 
 
 @pytest.mark.parametrize(
