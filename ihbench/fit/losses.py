@@ -56,8 +56,9 @@ def pyramid_distance(rgb: Tensor, image: Tensor) -> Tensor:  # [h, w, 3]
     return total + difference.abs().mean()
 
 
-def perceptual(net: str, device: torch.device) -> Perceptual | str:
-    """LPIPS with one of its networks as a differentiable loss; the reason when its weights are not here."""
+def perceptual(net: str, device: torch.device, least: int | None = None) -> Perceptual | str:
+    """LPIPS with one of its networks as a differentiable loss; the reason when its weights are not here. Images of a
+    side below `least` px are padded with grey: by default as the metric pads them."""
     from ihbench.metrics.lpips import MIN_SIDE, PADDING, load
 
     network = load(net)
@@ -65,10 +66,11 @@ def perceptual(net: str, device: torch.device) -> Perceptual | str:
         return network
     # the metric's own network stays as it is, on the CPU
     package = copy.deepcopy(network.package).to(device).requires_grad_(False)
+    side = MIN_SIDE if least is None else least
 
     def distance(rgb: Tensor, image: Tensor) -> Tensor:
         height, width = rgb.shape[:2]
-        pad = (0, max(MIN_SIDE - width, 0), 0, max(MIN_SIDE - height, 0))
+        pad = (0, max(side - width, 0), 0, max(side - height, 0))
         x, y = (F.pad(each.permute(2, 0, 1)[None], pad, value=PADDING) for each in (rgb, image))
         return package(2 * x - 1, 2 * y - 1).sum()
 

@@ -18,7 +18,7 @@ from ihbench.fit.rays.patch_loss import patch_distance, patch_loss
 from ihbench.fit.rays.sampling import draw_patches
 from ihbench.methods.humannerf.avatar import HumanNerfAvatar
 from ihbench.methods.humannerf.spec import STATE
-from ihbench.scene.contracts import TrainingSet
+from ihbench.scene.contracts import MaskState, TrainingSet
 from ihbench.scene.spread import spread
 
 LOOKED_AT, LOOKED_PX = 16, 32  # pictures of the guard, and their longer side; the released ones have all pixels
@@ -113,8 +113,8 @@ class HumanNerfFit(FieldOptimisation[HumanNerfAvatar]):
 
     @torch.no_grad()
     def _look(self) -> None:
-        """Raise `ShowsNothing` where one of the pictures does (trainer.py:171-175, 242-255)."""
-        views = self.training.views
+        """Raise `ShowsNothing` where a picture of somebody does (trainer.py:171-175, 242-255)."""
+        views = [view for view in self.training.views if (view.mask == MaskState.PERSON).any()]
         for view in (views[k] for k in spread(len(views), LOOKED_AT)):
             share = LOOKED_PX / max(view.camera.width, view.camera.height)
             width, height = (max(round(share * n), 1) for n in (view.camera.width, view.camera.height))
@@ -133,7 +133,8 @@ class HumanNerfFit(FieldOptimisation[HumanNerfAvatar]):
         avatar.load_state_dict(fresh.state_dict())
         avatar.restarts.fill_(restarts)
         self.optimizer.state.clear()
-        self.step, avatar.step, self._good, self._usual = 0, 0, None, None
+        self.step, avatar.step, self.rolled_back = 0, 0, 0
+        self._good = self._first_bad = self._usual = None
 
 
 def restarted(seed: int, restarts: int) -> int:

@@ -13,7 +13,7 @@ from ihbench.errors import BadInput, Diverged
 from ihbench.fit.rays.patch_loss import patch_distance
 from ihbench.methods.humannerf.avatar import HumanNerfAvatar
 from ihbench.methods.humannerf.config import EARLY, PAPER, PROFILES, QUICK, SMOKE, leave_out
-from ihbench.methods.humannerf.fitting import MOST_RESTARTS, HumanNerfFit, restarted
+from ihbench.methods.humannerf.fitting import MOST_RESTARTS, HumanNerfFit, ShowsNothing, restarted
 from ihbench.methods.humannerf.method import HumanNerfMethod
 from ihbench.methods.humannerf.stress import CASES, TINY
 from ihbench.scene.contracts import MaskState
@@ -69,13 +69,13 @@ def test_the_loss_is_squared_error_and_a_distance_of_patches(views):
 
 
 def test_without_weights_another_distance_stands_for_lpips_and_the_record_says_so(views, monkeypatch):
-    monkeypatch.setattr("ihbench.fit.rays.patch_loss.perceptual", lambda net, device: f"no weights of {net}")
+    monkeypatch.setattr("ihbench.fit.rays.patch_loss.perceptual", lambda net, device, least: f"no weights of {net}")
     for instead, words in (("pyramid", "pyramid stands for it"), ("none", "nothing stands for it")):
         ledger = Ledger()
         fitted(training_set(views), ledger=ledger, lpips=1.0, without_lpips=instead, steps=1)
         assert events(ledger, "left_out") == [{"what": "lpips term", "reason": f"no weights of vgg; {words}"}]
     monkeypatch.setattr(
-        "ihbench.fit.rays.patch_loss.perceptual", lambda net, device: lambda rgb, image: rgb.mean() * 0 + 5
+        "ihbench.fit.rays.patch_loss.perceptual", lambda net, device, least: lambda rgb, image: rgb.mean() * 0 + 5
     )
     fit = a_fit(training_set(views), lpips=2.0, mse=0.0, patches=3)
     fit._perceptual = distance_of(fit)
@@ -199,6 +199,21 @@ def test_an_empty_picture_starts_the_fit_again(views):
     resumed = a_fit(training_set(views), ledger=ledger, guard=(2,))
     resumed.run(Progress.silent())
     assert equal_bits(everything(fit.avatar), everything(resumed.avatar))
+
+
+def test_a_new_start_has_the_step_sizes_of_the_first(views):
+    fit = a_fit(training_set(views))
+    fit.rolled_back = 1
+    fit._roll_back(ShowsNothing(3, "the picture of frame 0 shows nothing"))
+    fit._one_step(0)
+    assert [group["lr"] for group in fit.optimizer.param_groups] == fit.rates
+
+
+def test_a_frame_beside_which_the_person_stands_need_not_show_anybody(views):
+    away = replace(views[0], body_pose=a_pose(transl=(5, 0, 0)), mask=np.zeros_like(views[0].mask))
+    fit = a_fit(training_set([away, *views[1:]]), guard=(2,))
+    fit.run(Progress.silent())
+    assert int(fit.avatar.restarts) == 0
 
 
 def test_a_fit_that_is_empty_after_every_start_is_a_divergence(views):

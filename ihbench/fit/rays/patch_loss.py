@@ -9,11 +9,14 @@ from ihbench.clock.events import LeftOut
 from ihbench.clock.ledger import Ledger
 from ihbench.fit.losses import Perceptual, perceptual, pyramid_distance
 
+LEAST = {"vgg": 16, "alex": 31, "squeeze": 20}  # px, of which a trunk's poolings leave a pixel
+
 
 def patch_distance(net: str, instead: str, device: torch.device, ledger: Ledger) -> Perceptual | None:
-    """LPIPS with one of its networks. Where its weights are missing `pyramid_distance`, or None where another name
-    than `pyramid` is to stand for it, and the ledger has an event that says so."""
-    distance = perceptual(net, device)
+    """LPIPS with one of its networks, of patches as they are: padded to the metric's 64² a patch of 32² is three
+    quarters grey. Where its weights are missing `pyramid_distance`, or None where another name than `pyramid` is to
+    stand for it, and the ledger has an event that says so."""
+    distance = perceptual(net, device, LEAST[net])
     if not isinstance(distance, str):
         return distance
     words = f"{instead} stands for it" if instead == "pyramid" else "nothing stands for it"

@@ -1,14 +1,23 @@
 """The loss of patches, and what stands for LPIPS where its weights are missing."""
 
+import sys
+
 import pytest
 import torch
 
 from ihbench.clock.ledger import Ledger
 from ihbench.fit.losses import pyramid_distance
 from ihbench.fit.rays import patch_loss as module
-from ihbench.fit.rays.patch_loss import patch_distance, patch_loss
+from ihbench.fit.rays.patch_loss import LEAST, patch_distance, patch_loss
+from ihbench.metrics.lpips import random_networks
 
 CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def random_trunks():
+    with random_networks() as networks:
+        yield networks
 
 
 def test_squared_error_and_the_mean_distance_of_patches():
@@ -19,7 +28,7 @@ def test_squared_error_and_the_mean_distance_of_patches():
 
 
 def test_what_stands_for_lpips_is_said_once(monkeypatch):
-    monkeypatch.setattr(module, "perceptual", lambda net, device: f"no weights of {net}")
+    monkeypatch.setattr(module, "perceptual", lambda net, device, least: f"no weights of {net}")
     ledger = Ledger()
     for _ in range(2):
         assert patch_distance("vgg", "pyramid", CPU, ledger) is pyramid_distance
@@ -27,8 +36,22 @@ def test_what_stands_for_lpips_is_said_once(monkeypatch):
     assert event.data["reason"] == "no weights of vgg; pyramid stands for it"
     assert patch_distance("vgg", "none", CPU, ledger) is None
     assert ledger.events[-1].data["reason"].endswith("nothing stands for it")
-    monkeypatch.setattr(module, "perceptual", lambda net, device: pyramid_distance)
+    monkeypatch.setattr(module, "perceptual", lambda net, device, least: pyramid_distance)
     assert patch_distance("vgg", "none", CPU, Ledger()) is pyramid_distance
+
+
+@pytest.mark.parametrize("net", ["vgg", "alex", "squeeze"])
+def test_lpips_sees_patches_as_they_are(net, random_trunks, monkeypatch):
+    """Unpadded wherever the trunk leaves a pixel of them; where it would not, padded to what it needs."""
+    monkeypatch.setattr(sys.modules["ihbench.metrics.lpips"], "load", random_trunks.__getitem__)
+    distance = patch_distance(net, "none", CPU, Ledger())
+    assert distance is not None
+    generator = torch.Generator().manual_seed(0)
+    rgb, image = torch.rand(2, 32, 32, 3, generator=generator)
+    own, other = (2 * each.permute(2, 0, 1)[None] - 1 for each in (rgb, image))
+    expected = random_trunks[net].package(own, other).item()
+    assert distance(rgb, image).item() == pytest.approx(expected, rel=1e-6)
+    assert 0 < distance(rgb[: LEAST[net] - 1], image[: LEAST[net] - 1]).item() < 10
 
 
 def test_the_distance_without_weights():
