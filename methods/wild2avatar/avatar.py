@@ -125,9 +125,9 @@ class Wild2AvatarAvatar(nn.Module):
         frame: int | None = None,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """rgb [H, W, 3] on `background` and alpha [H, W]; see `scene.contracts.Avatar`. The person alone, in the pose
-        given, within .1 m of the posed body."""
-        pose = BodyPose(body_pose.pose, self.betas, body_pose.transl)
-        posed = PosedBody(self.canonical, self.canonical.bones_of(pose))
+        given and the shape fitted, within .1 m of the posed body."""
+        shape = None if self.poses is None else self.poses.betas
+        posed = PosedBody(self.canonical, self.canonical.bones_of(body_pose, shape))
         near, far = near_body(camera, posed.vertices.double().cpu().numpy(), self.device)
         rgb = near.new_tensor(background).repeat(len(near), 1)
         alpha = torch.zeros_like(near)
@@ -138,10 +138,10 @@ class Wild2AvatarAvatar(nn.Module):
             human = march_human(self.field, posed, rays, near[pixels], far[pixels], followed, how)
             rgb[pixels] = human.rgb + (1 - human.alpha)[:, None] * rgb[pixels]
             alpha[pixels] = human.alpha
-        shape = camera.height, camera.width
+        size = camera.height, camera.width
         return (
-            rgb.clamp(0, 1).reshape(*shape, 3).cpu().numpy(),
-            alpha.clamp(0, 1).reshape(shape).cpu().numpy(),
+            rgb.clamp(0, 1).reshape(*size, 3).cpu().numpy(),
+            alpha.clamp(0, 1).reshape(size).cpu().numpy(),
         )
 
     # --- on disk ---

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 from ihbench.config_fields import STEPS, Within, check
+from ihbench.errors import BadInput
 from ihbench.scene.plan import Omission, SceneMeasure
 
 WEIGHT, RATE = Within(0, 1e6), Within(0, 1000)  # of a term of the loss; a learning rate
@@ -131,6 +132,12 @@ class Wild2AvatarConfig:
 
     def __post_init__(self) -> None:
         check(self, "--method.")
+        encoded = 3 + 6 * self.sdf_frequencies
+        if 0 < self.sdf_skip < self.sdf_depth and self.sdf_width <= encoded:
+            raise BadInput(
+                f"--method.sdf-width: expected more than the {encoded} values of an encoded place, which enter again "
+                f"at --method.sdf-skip {self.sdf_skip}, got {self.sdf_width}"
+            )
 
 
 PAPER = Wild2AvatarConfig()

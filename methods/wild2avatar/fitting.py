@@ -102,7 +102,8 @@ class Wild2AvatarFit(Optimisation[Wild2AvatarAvatar]):
     def _rate_share(self) -> float:
         if self.avatar.config.decay == "cosine":
             return super()._rate_share()
-        return math.prod(0.5 for epoch in HALVED_AT if self.epoch >= epoch)
+        rise = min((self.step + 1) / max(self.warm_up * self.steps, 1), 1)
+        return rise * math.prod(0.5 for epoch in HALVED_AT if self.epoch >= epoch)
 
     def _followed(self, row: int) -> Tensor | None:
         """[69] rad of the pose that shape and colour follow in this step; None for none."""

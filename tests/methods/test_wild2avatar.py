@@ -215,6 +215,9 @@ def test_drawing_takes_the_pose_given_whatever_the_frame():
     for a, b in zip(before, avatar.render(camera, pose, frame=2), strict=True):
         assert np.array_equal(a, b)
     assert not torch.equal(avatar.bones(2), begun(TINY, training).bones(2))
+    with torch.no_grad():  # the shape is the person's, whatever the pose
+        avatar.poses.betas += 2.0
+    assert not np.array_equal(before[1], avatar.render(camera, pose, frame=2)[1])
 
 
 def test_pose_conditioning_at_test_time():
@@ -311,7 +314,7 @@ def test_a_layer_before_the_visible_person_moves_no_colour():
 def test_schedules():
     training = boxed_set()
     fit = Wild2AvatarFit(
-        start(replace(TINY, decay="halves", pose_conditioning=True), training), training, 0, Ledger()
+        start(replace(TINY, decay="halves", warm_up=0.0, pose_conditioning=True), training), training, 0, Ledger()
     )
     shares, counted, followed = [], [], []
     for epoch in (0, 1, 2, 20, 21, 199, 200, 500, 700):
@@ -322,6 +325,8 @@ def test_schedules():
     assert shares == [1, 1, 1, 1, 1, 1, 0.5, 0.25, 0.25]
     assert counted == [0, 10, 20, 200, 200, 200, 200, 200, 200]  # ramp of 20 epochs
     assert followed == [False, False, True, False, True, True, False, False, False]
+    fit.step, fit.warm_up = 0, 1.0
+    assert fit._rate_share() == 1 / fit.steps
     assert (PAPER.ramp_epochs, PAPER.refresh_epochs, PAPER.rays) == (200, 20, 512)
 
 

@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from scipy.spatial import KDTree
 
+from ihbench.errors import BadInput
 from ihbench.methods.wild2avatar.config import PAPER, QUICK, SMOKE
 from ihbench.methods.wild2avatar.layers import Layer, background_layer, occlusion_layer, together
 from ihbench.methods.wild2avatar.losses import LEAST, Rays, binary_entropy, eikonal, ray_losses
@@ -70,6 +71,18 @@ def some_rays(count=50, distance=2.7, seed=0):
 
 
 # ------------------------------------------------------------------------------------------- check 1: the density
+
+
+def test_sizes_of_the_distance_network_work_or_are_refused():
+    """With a layer that sees the place again, without, and with one that would come after the last."""
+    points = torch.zeros(2, 3)
+    for depth, skip in ((8, 4), (4, 4), (3, 4), (5, 4), (1, 1), (2, 1), (3, 0)):
+        config = replace(PAPER, sdf_width=64, sdf_depth=depth, sdf_skip=skip, pose_conditioning=False)
+        network = HumanField(config, torch.Generator().manual_seed(0)).sdf
+        assert network(points, None)[0].isfinite().all()
+    with pytest.raises(BadInput, match=r"sdf-width: expected more than the 39 values.*sdf-skip 4, got 32"):
+        replace(PAPER, sdf_width=32)
+    assert replace(PAPER, sdf_width=32, sdf_skip=0).sdf_width == 32
 
 
 def test_check_1_density_at_and_around_the_surface():

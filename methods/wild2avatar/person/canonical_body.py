@@ -62,10 +62,11 @@ class CanonicalBody(nn.Module):
             joints = joints + self.joint_shapes @ (betas - torch.from_numpy(np.array(self.betas)).to(betas))
         return joint_transforms(pose, joints, self.parents, transl) @ self.from_canonical
 
-    def bones_of(self, body_pose: BodyPose) -> Tensor:
-        """[24, 4, 4] of a given pose, with the person's own shape whatever the pose's coefficients are."""
+    def bones_of(self, body_pose: BodyPose, betas: Tensor | None = None) -> Tensor:
+        """[24, 4, 4] of a given pose, with the person's own shape whatever the pose's coefficients are: the first,
+        or `betas` [B]."""
         pose, transl = (torch.from_numpy(np.array(x)).to(self.vertices) for x in (body_pose.pose, body_pose.transl))
-        return self.bones(pose, transl)
+        return self.bones(pose, transl, betas)
 
 
 class BodySurface:

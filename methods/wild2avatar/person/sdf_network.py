@@ -29,7 +29,7 @@ class SdfNetwork(nn.Module):
         layers = []
         for k in range(depth):
             inputs = (self.encoded + POSE * posed) if k == 0 else width
-            outputs = width - self.encoded if 0 < skip == k + 1 else width
+            outputs = width - self.encoded if 0 < skip == k + 1 < depth else width
             layer = nn.Linear(inputs, outputs)
             nn.init.normal_(layer.weight, 0, math.sqrt(2 / outputs), generator)
             nn.init.zeros_(layer.bias)
