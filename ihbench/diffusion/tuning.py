@@ -149,8 +149,9 @@ class Tuning:
                 p.copy_(torch.as_tensor(tensors[f"p.{name}"]))
                 if f"adam.{name}.step" in tensors:
                     keys = ("step", "exp_avg", "exp_avg_sq")
-                    kept = {key: torch.as_tensor(tensors[f"adam.{name}.{key}"]).clone() for key in keys}
-                    optimizer.state[p] = {k: v if k == "step" else v.to(p.device) for k, v in kept.items()}
+                    optimizer.state[p] = {
+                        key: torch.as_tensor(tensors[f"adam.{name}.{key}"]).to(p.device, copy=True) for key in keys
+                    }
         curve.steps[:], curve.losses[:] = list(meta["steps"]), list(meta["losses"])
         self.ledger.event(Resumed(state, int(meta["step"])))
         return int(meta["step"])

@@ -26,7 +26,7 @@ Backdrop = Literal["random", "protocol"]
 # scene/gaussian_model.py:564-612: 3DGS's growth without any gate
 RELEASED_DENSITY = DensityConfig(
     after=1500, before=3500, every=500, gradient=5e-5, size=0.01, clone="in_place", kl_grow=None, kl_merge=None,
-    faint=0.005, largest=0.05, widest=20.0,
+    faint=0.005, largest=0.05,
 )  # fmt: skip
 
 NOTHING_UNSEEN = 0.002  # share of the texels that no frame shows; fewer are specks

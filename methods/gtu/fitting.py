@@ -92,7 +92,7 @@ class GtuFit(GaussianOptimisation[GtuAvatar]):
             [ParameterGroup(list(avatar.poses), config.lr_pose, eps=EPS)],
             rates(config),
             config.density,
-            DensityRules(spared=of_body, unwanted=lambda g: avatar.deformation.outside(g.means)),
+            DensityRules(spared=of_body, stays=of_body, unwanted=lambda g: avatar.deformation.outside(g.means)),
             steps=config.steps,
             views=len(views),
         )
@@ -144,6 +144,9 @@ class GtuFit(GaussianOptimisation[GtuAvatar]):
         return weight * loss + config.opaque * doubt
 
     # --- an iteration ---
+
+    def _restored(self) -> None:
+        self.avatar.degree = self.avatar.config.degree_at(self.step)  # as the last step had it
 
     def _before_step(self) -> None:
         self.avatar.degree = self.avatar.config.degree_at(self.step + 1)

@@ -56,6 +56,18 @@ def with_(config=PLAIN, **changes):
     return dataclasses.replace(config, **changes)
 
 
+def originals(gaussians):
+    return gaussians.carried("original")
+
+
+def everyone(gaussians):
+    return torch.ones(len(gaussians), dtype=torch.bool)
+
+
+def some(gaussians):
+    return gaussians.carried("original") & (gaussians.carried("parent") % 3 == 0)
+
+
 def parents(adam):
     return adam.gaussians.carried("parent").tolist()
 
@@ -328,12 +340,21 @@ def test_broken_gaussians_are_an_outcome():
 def test_spared_ones_stay():
     """GTU: original vertices are never removed, not even when split; what would have gone is told."""
     adam = adam_of([0.02, 0.005, 0.005], opacity=1e-4)
-    rules = DensityRules(spared=lambda gaussians: gaussians.carried("original"))
+    rules = DensityRules(spared=originals, stays=originals)
     control = control_of(adam, with_(faint=0.005), gradient=[1.0, 0, 0], rules=rules)
     event = control.after_step(EVENT)
     assert parents(adam) == [0, 1, 2]  # its children are faint as well, and no originals
     assert (event.split, event.pruned, event.spared) == (1, 2, 3)
     assert control.kept_back.tolist() == [True] * 3
+
+
+def test_what_is_spared_gives_way_to_its_children():
+    """OccGaussian: hidden ones are not pruned, but split as others are."""
+    adam = adam_of([0.02, 0.005], opacity=1e-4)
+    control = control_of(adam, with_(faint=0.005), gradient=[1.0, 0], rules=DensityRules(spared=everyone))
+    event = control.after_step(EVENT)
+    assert parents(adam) == [1, 0, 0]
+    assert (event.split, event.pruned, event.spared) == (1, 0, 3)
 
 
 def test_spared_ones_are_not_merged_and_what_may_not_grow_does_not():
@@ -349,7 +370,7 @@ def test_a_method_of_two_phases_with_vertices_put_back():
     """GTU: vertices that would go are put back, faint; after growth has ended only pruning goes on."""
     start = 0.02
     adam = adam_of([start, start, start])
-    control = control_of(adam, rules=DensityRules(spared=lambda gaussians: gaussians.carried("original")))
+    control = control_of(adam, rules=DensityRules(spared=originals, stays=originals))
     assert control.after_step(EVENT).count == 3 + 2 * 3
     back = control.kept_back
     assert back.tolist() == [True] * 3 + [False] * 6
@@ -498,8 +519,8 @@ def test_counts_and_rows_agree_whatever_the_options(
         **{"clone": clone, "kl_grow": kl_grow, "kl_merge": kl_merge, "pairs": pairs, "indexing": indexing},
         **{"faint": faint, "children": children, "most": most},
     )
-    spared = DensityRules(spared=lambda g: g.carried("original") & (g.carried("parent") % 3 == 0))
-    control = control_of(adam, config, torch.tensor(rng.uniform(0, 4e-4, n)), rules=spared if seed % 2 else None)
+    rules = (None, DensityRules(spared=some, stays=some), DensityRules(spared=some))[seed % 3]
+    control = control_of(adam, config, torch.tensor(rng.uniform(0, 4e-4, n)), rules=rules)
     fit_step = adam.gaussians
     try:
         event = control.after_step(EVENT)
@@ -511,6 +532,6 @@ def test_counts_and_rows_agree_whatever_the_options(
     assert n_now <= max(n, most)
     assert len(control.state) == len(control.kept_back) == len(fit_step.carried("parent")) == n_now
     assert not fit_step.broken().any()
-    if seed % 2:
+    if seed % 3 == 1:
         assert {k for k in range(0, n, 3)} <= set(fit_step.carried("parent")[fit_step.carried("original")].tolist())
     fit(control, EVENT + 1, EVENT + 3)

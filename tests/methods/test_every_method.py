@@ -16,7 +16,7 @@ from ihbench.errors import BadInput
 from ihbench.scene.contracts import MaskState, TrainView
 from ihbench.scene.method_spec import method_spec, usable_specs
 
-from .tiny_fit import training_set
+from .tiny_fit import equal_bits, everything, training_set
 
 STRESS = {  # of those that make one shape of all frames'; others pose each frame by its own
     "gaussianavatar": "gaussianavatar.stress",
@@ -64,3 +64,17 @@ def test_shapes_that_differ_by_frame_become_their_mean_and_are_said(method, view
     assert np.array(avatar.betas).tolist() == [-0.5, 0.0]
     said = [event.data["what"] for event in ledger.events if event.kind == Warned.kind]
     assert sum("shape coefficients vary over the frames" in what for what in said) == 1
+
+
+@pytest.mark.parametrize("method", SYSTEMS)
+def test_a_finished_fit_gone_on_with_is_the_same(method, views):
+    """Killed after its last step, while its avatar was saved or scored, a fit begins again and has nothing to do."""
+    package = method.replace("-", "_").replace("occgauhuman", "gauhuman")
+    stress = import_module(f"ihbench.methods.{STRESS.get(method, package + '.stress')}")
+    config, ledger = stress.OCCLUDED_ONES.tiny if method == "occgauhuman" else stress.TINY, Ledger()
+    first, again = (fit(method, config, views, ledger) for _ in range(2))
+    assert equal_bits(everything(first), everything(again))
+    for one, other in zip(
+        *(a.render(views[0].camera, views[0].body_pose, frame=0) for a in (first, again)), strict=True
+    ):
+        assert np.array_equal(one, other)

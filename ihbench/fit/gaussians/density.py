@@ -50,13 +50,13 @@ def split(
     *,
     children: int = 2,
     shrink: float = 1.6,
-    spared: Tensor | None = None,  # [N] bool
+    stays: Tensor | None = None,  # [N] bool
 ) -> Rows:
     """Replace each of the chosen by children at places drawn from it, with scales divided by `shrink`, equal in all
-    else. Those spared stay beside their children."""
+    else. Those of `stays` remain beside their children."""
     parents = chosen.nonzero()[:, 0].repeat(children)
     gaussians = adam.gaussians
-    rows = Rows.made(~chosen if spared is None else ~chosen | spared, parents)
+    rows = Rows.made(~chosen if stays is None else ~chosen | stays, parents)
     own = {
         "means": drawn_from(gaussians, parents, generator),
         "log_scales": gaussians.log_scales.detach()[parents] - math.log(shrink),
@@ -150,7 +150,9 @@ class DensityRules:
     may_grow: Mask | None = None
     """Only these are cloned, split and merged (OccGaussian: those that were seen)."""
     spared: Mask | None = None
-    """These are never removed (GTU: the original vertices; OccGaussian: what is hidden) and not merged."""
+    """These are never pruned (GTU: the original vertices; OccGaussian: what is hidden) and not merged."""
+    stays: Mask | None = None
+    """These stay beside their children when they are split (GTU: the original vertices)."""
     unwanted: Mask | None = None
     """These are pruned, whatever their opacity."""
 
@@ -184,8 +186,8 @@ class DensityControl:
         self.adam, self.config, self.seed, self.rules = adam, config, seed, rules or DensityRules()
         self.state = DensityState.none(len(adam.gaussians), adam.gaussians.means.device)
         self.kept_back = torch.zeros_like(self.state.steps, dtype=torch.bool)
-        """[N] bool: what the last change would have removed but for the rule `spared`. To be read before the next
-        step; it is not saved."""
+        """[N] bool: what the last change would have removed but for the rules `spared` and `stays`. To be read before
+        the next step; it is not saved."""
 
     def observe(self, step: int, gradient: Tensor, radius: Tensor, width: int, height: int) -> None:
         """Count the screen gradient of step `step` (`DensityState.add`), if a later change may ask for it."""
@@ -239,15 +241,14 @@ class DensityControl:
         if cloned := int(chosen.sum()):
             generator = self._generator(step, CLONE) if config.clone == "sampled" else None
             self._follow(clone(adam, chosen, generator))
-        # what is spared stays beside its children
-        added = config.children if self.rules.spared else config.children - 1
+        added = config.children if self.rules.stays else config.children - 1
         room = (config.most - len(adam.gaussians)) // added
         chosen = self._chosen(self.state.mean(), config.split, large=True, room=room)
         if halved := int(chosen.sum()):
-            spared = self._mask(self.rules.spared)
-            self.kept_back |= chosen & spared
+            stays = self._mask(self.rules.stays)
+            self.kept_back |= chosen & stays
             generator = self._generator(step, SPLIT)
-            rows = split(adam, chosen, generator, children=config.children, shrink=config.shrink, spared=spared)
+            rows = split(adam, chosen, generator, children=config.children, shrink=config.shrink, stays=stays)
             self._follow(rows)
         return cloned, halved, self._merge(gradient)
 
