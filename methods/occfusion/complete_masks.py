@@ -46,10 +46,10 @@ class CompleteMasks:
         return own | (hidden & self._covered(view)) if hidden.any() else own
 
     def undecided(self, k: int, view: TrainView) -> NDArray[np.bool_]:
-        """[H, W] where nobody knows whether M̂ reaches: of a view that was not painted while others were, what may be
-        hidden just beside the posed body. Taken for background, it would cut people's clothes off."""
+        """[H, W] where nobody knows whether M̂ reaches: of a view that was not painted, what may be hidden just
+        beside the posed body. Taken for background, it would cut people's clothes off."""
         hidden = may_hide(view, self.config)
-        if not self.painted or k in self.painted or not hidden.any():
+        if k in self.painted or not hidden.any():
             return np.zeros_like(hidden)
         covered = self._covered(view)
         return hidden & ~covered & _near(covered, self.config.inpaint.reach)
