@@ -136,7 +136,7 @@ class Stage1(TexelStage):
         loss = self._images_loss([self._targets[view] for view in self.batch_of(k)], decoded, one=True)
         return (
             loss
-            + config.scale_weight * decoded.scale.mean()
+            + config.scale_weight * self.avatar.of_points(decoded).scale.mean()
             + offset_weight(config, self.epoch) * decoded.offset.square().mean()
             + config.feature_weight * self.avatar.features.square().mean()
         )

@@ -301,11 +301,13 @@ def test_the_network_is_what_it_was_rewritten_from(training):
     np.testing.assert_allclose(decoded.color, 1 / (1 + np.exp(-out["color"])), atol=1e-6)
 
 
-def test_the_loss_is_the_sum_of_its_terms(training):
+@pytest.mark.parametrize("texels", ["charts", "all"])
+def test_the_loss_is_the_sum_of_its_terms(training, texels):
+    """Offsets are held small at every texel that is decoded, scales at those that are drawn."""
     from ihbench.fit.losses import dissimilarity
     from ihbench.render.splat import render_gaussians
 
-    config = replace(TINY, scale_weight=2.0, offset_weight=30.0, feature_weight=5.0)
+    config = replace(TINY, decoded=texels, scale_weight=2.0, offset_weight=30.0, feature_weight=5.0)
     avatar = an_avatar(config)
     stage = Stage1(avatar, training, 0, Ledger())
     k = stage._view_of(0, 4)
@@ -313,13 +315,15 @@ def test_the_loss_is_the_sum_of_its_terms(training):
     image = np.where((view.mask == MaskState.PERSON)[..., None], view.image / 255, 1).astype(np.float32)
     avatar.scale_share = 0.5
     decoded = avatar.decode()
-    offset, scale, color = decoded.offset, decoded.scale, decoded.color
+    drawn = avatar.of_points(decoded)
+    assert (len(drawn.scale) < len(decoded.scale)) == (texels == "all")
+    offset, scale, color = drawn.offset, drawn.scale, drawn.color
     means = avatar.posed(offset, avatar.transforms(view.body_pose))
     rgb = render_gaussians(means, scale, color, view.camera, WHITE)[0]
     truth = torch.from_numpy(image)
     ones = torch.ones(SIZE, SIZE, 1)
     expected = 0.8 * (rgb - truth).abs().mean() + 0.2 * dissimilarity(rgb, truth, ones)
-    expected = expected + 2 * scale.mean() + 30 * offset.square().mean() + 5 * avatar.features.square().mean()
+    expected = expected + 2 * scale.mean() + 30 * decoded.offset.square().mean() + 5 * avatar.features.square().mean()
     assert stage._loss(k).item() == pytest.approx(expected.item(), rel=1e-5)
 
 
