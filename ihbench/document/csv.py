@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ihbench.document.document import Block, Bullets, Heading, Number, Paragraph, Table, plain_text
+from ihbench.document.document import Block, Bullets, Heading, Number, Paragraph, Span, Table, plain_text, spans
 from ihbench.errors import visible
 
 FORMULA = ("=", "+", "-", "@", "\t", "\r")  # what a spreadsheet runs
@@ -61,6 +61,7 @@ def write_cells(name: str, tables: Sequence[Table], footnotes: Mapping[str, str]
             "metric": column.metric.title,
             "unit": column.metric.unit,
             **_number(number, footnotes),
+            "row_footnotes": _of_row(table, k, footnotes),
         }
         for table in tables
         for k, label in enumerate(table.labels)
@@ -98,6 +99,7 @@ def table_data(table: Table, footnotes: Mapping[str, str]) -> dict[str, object]:
                 "section": label.section,
                 "status": plain_text(table.rows[k][1]),
                 "calibration": label.bound,
+                "footnotes": _of_row(table, k, footnotes),
                 "components": [plain_text(cell) for cell in table.rows[k][ticks]],
                 "cells": [_number(number, footnotes) for number in table.numbers(k)],
             }
@@ -105,6 +107,12 @@ def table_data(table: Table, footnotes: Mapping[str, str]) -> dict[str, object]:
         ],
         "notes": list(table.notes),
     }
+
+
+def _of_row(table: Table, k: int, footnotes: Mapping[str, str]) -> list[str]:
+    """What the letters at a row's name say."""
+    said = [piece.text for piece in spans(table.rows[k][0]) if isinstance(piece, Span) and piece.style == "raised"]
+    return [footnotes[letter] for letter in ", ".join(said).split(", ") if letter in footnotes]
 
 
 def _number(number: Number, footnotes: Mapping[str, str]) -> dict[str, object]:

@@ -18,6 +18,7 @@ from ihbench.record.results import RunResult, grouped
 from ihbench.record.scene_means import per_scene, seed_means
 from ihbench.reports.general.clock import clock_notes, one_clock
 from ihbench.reports.general.content import data_words
+from ihbench.reports.general.remarks import BACK, FIT, row_footnotes
 from ihbench.reports.general.significance import ALPHA, LEVEL
 from ihbench.runner.ablation import AblationSuite, Comparison
 from ihbench.runner.executor import CellOutcome
@@ -94,6 +95,7 @@ def _table(suite: AblationSuite, protocol: str, cells: Found) -> tuple[list[Bloc
     for variant, having in runs.items():
         omissions = [f"{what} in {n} of {len(having)} runs" for what, n in _omissions(having).items()]
         notes += [f"left out by the plan, {variant}: {'; '.join(omissions)}"] if omissions else []
+        notes += [f"{variant}: {note}" for note in row_footnotes(having, (FIT, BACK))]
     blocks += bullets([*notes, *clock_notes(timed)])
     more, compared = _comparisons(suite.comparisons, runs, columns)
     if quoted:

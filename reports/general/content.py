@@ -29,6 +29,7 @@ from ihbench.record.row_labels import by_label
 from ihbench.reports.general.clock import one_clock
 from ihbench.reports.general.inpainting import inpainting_section
 from ihbench.reports.general.ledger_table import ledger_section
+from ihbench.reports.general.remarks import remarks
 from ihbench.reports.general.run_time import across_sizes_section, run_time_section
 from ihbench.reports.general.significance import further_rows, intervals_section, score_cells
 from ihbench.reports.general.strip_cost import strip_cost_section
@@ -121,7 +122,7 @@ def _group(runs: list[RunResult], presets: Sequence[str], targets: Sequence[Targ
     blocks.append(Paragraph(note))
     blocks += _definitions(identities)
     present = [row for row in ROWS if any(row in run.rows for run in done)]
-    blocks += bullets([*(f"{row}: {DESCRIPTIONS[row]}" for row in present), *_remarks(done)])
+    blocks += bullets([*(f"{row}: {DESCRIPTIONS[row]}" for row in present), *remarks(done)])
     for preset in presets:
         blocks += _preset(preset, done, headline)
     labelled = by_label(done)
@@ -207,33 +208,3 @@ def _table(
 def _mean_of(runs: list[RunResult], key: str, shown: str = "{:.0f}") -> str:
     known = [value for run in runs if (value := getattr(run.about, key)) is not None]
     return shown.format(sum(known) / len(known)) if known else "—"
-
-
-def _remarks(runs: list[RunResult]) -> list[str]:
-    """Why cells of the methods' rows are empty, what their means do not run over, what the plan left out."""
-    absent: dict[tuple[str, str], list[str]] = {}
-    partly: dict[tuple[str, str, str], list[str]] = {}
-    notes: list[str] = []
-    omitted: dict[tuple[str, str], list[str]] = {}  # row and what was left out -> scenes
-    labels = {id(run): label for label, group in by_label(runs).items() for run in group}
-    for run in runs:
-        for identity, mean in run.own.items():
-            metric, region = identity.display.title, identity.region
-            if mean.absent:
-                absent.setdefault((metric, mean.reason), []).append(region)
-            elif mean.note:
-                partly.setdefault((run.scene, region, mean.note), []).append(metric)
-        for o in run.about.left_out or ():
-            what = f"{o.field} → {o.value}: {o.reason}"
-            omitted.setdefault((labels[id(run)], what), []).append(run.scene)
-        files = run.about.predictions
-        remarks = () if files is None else (*files.notes, *files.doubts)
-        notes += [f"{run.method} on {run.scene}: {note}" for note in remarks]
-        notes += [f"{run.method} on {run.scene}: not shown: {damage}" for damage in run.damage]
-    for (label, what), scenes in omitted.items():
-        notes.append(f"left out, {label} on {', '.join(dict.fromkeys(scenes))}: {what}")
-    for (scene, region, note), metrics in partly.items():
-        notes.append(f"{region} of {scene} ({', '.join(dict.fromkeys(metrics))}): {note}")
-    for (metric, reason), regions in absent.items():
-        notes.append(f"absent: {metric}, {', '.join(dict.fromkeys(regions))}: {reason}")
-    return sorted(set(notes))

@@ -35,6 +35,7 @@ from ihbench.record.results import RunResult, group_row, grouped
 from ihbench.record.row_choice import EVERYTHING, Choice
 from ihbench.record.row_labels import by_label
 from ihbench.record.scene_means import scene_means
+from ihbench.reports.general.remarks import row_footnotes
 from ihbench.reports.general.significance import LEVEL
 from ihbench.reports.paper.comparison import as_the_profile_has_it, beaten_notes, rank_note
 from ihbench.reports.paper.paper_numbers import Column, Component, Group, PaperRow, PaperTable
@@ -337,8 +338,10 @@ def _measured_block(
     said = {spec.name: spec.footnote for spec in usable_specs() if spec.footnote}
     names: list[str | tuple[str | Span, ...]] = [label.name for label in labels]
     for k, (label, having) in enumerate(labelled.items()):
-        if having[0].method in said:
-            names[k] = (label, Span(footnotes.letter(said[having[0].method]), "raised"))
+        of_method = [said[having[0].method]] if having[0].method in said else []
+        done = [run for run in having if run.status == "done"]
+        if letters := footnotes.of([*of_method, *row_footnotes(done)]):
+            names[k] = (label, Span(", ".join(letters), "raised"))
     rows = [(names[k], MEASURED[kind], *parts[k], *(cells[k] for cells in columns)) for k in range(len(labels))]
     notes.append(
         f"Mean over seeds within a scene, then over scenes, with the {LEVEL:.0%} interval over scenes. A mark says "

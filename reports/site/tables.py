@@ -21,9 +21,9 @@ from ihbench.record.scene_means import per_scene, scene_means
 from ihbench.record.schema import ScoreLine, score_lines
 from ihbench.record.shareable import without_places
 from ihbench.reports.general.clock import machine_name, one_clock
+from ihbench.reports.general.remarks import said_by
 from ihbench.reports.general.significance import LEVEL, further_rows
 from ihbench.scene.method_spec import usable_specs
-from ihbench.scene.plan import Omission
 from ihbench.scoring.calibration import DESCRIPTIONS, ROWS
 
 Json = dict[str, Any]
@@ -227,17 +227,12 @@ def _run(run: RunResult, group: int, label: str) -> Json:
         "total": about.total_seconds,
         "peak": about.peak_mb,
         "hidden_share": about.hidden_share,
-        "left_out": [_omission(o) for o in about.left_out or ()],
-        "warnings": list(record.warnings),
+        "remarks": {kind: texts for kind, texts in said_by(run).items() if texts},
         "facts": _facts(run),
         "repeat": f"ihbench run --like {run.folder.name}",
         "command": " ".join(("ihbench", *about.command)) if about.command else "",
         "config": _shown_config(run.identity.config),
     }
-
-
-def _omission(omission: Omission) -> str:
-    return f"{omission.field} → {omission.value}: {omission.reason}"
 
 
 def _facts(run: RunResult) -> list[list[str]]:

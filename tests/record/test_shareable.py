@@ -108,6 +108,8 @@ def folders(tmp_path):
             "reason": "" if status == "done" else f"BadInput: {said} (see {folder}/x)",
         }
         record["warnings"] = [said]
+        event = {"kind": "left_out", "data": {"what": "a term", "reason": f"in its fit, {said}"}}
+        record["ledger"] = {"stages": {}, "seconds": 1.0, "cpu_seconds": 1.0, "events": [event]}
         record["about"] |= {"command": ["run", "--data", HERE], "changed": {"weights": said}}
         (folder / "run.json").write_text(json.dumps(record))
         lines = [json.loads(line) for line in (folder / "scores.jsonl").read_text().splitlines()]
@@ -130,3 +132,4 @@ def test_no_page_and_no_report_names_a_place(folders, tmp_path, monkeypatch):
         assert str(tmp_path) not in text, name
         assert "x.npy" in text, name
         assert "is cut off" in text, name
+        assert "in its fit" in text, name

@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from ihbench.clock.events import Event, Happening
+from ihbench.clock.ledger import LedgerState
 from ihbench.clock.machine import Machine
 from ihbench.config_fields import as_json
 from ihbench.files import atomic
@@ -49,6 +51,12 @@ def record(
 
 def with_about(run: RunResult, **changes: Any) -> RunResult:
     return replace(run, record=replace(run.record, about=replace(run.about, **changes)))
+
+
+def with_events(run: RunResult, *happenings: Happening) -> RunResult:
+    """The run with a ledger in which these things happened, and nothing else."""
+    events = tuple(Event.at(happening, 1.0, 1.0) for happening in happenings)
+    return replace(run, record=replace(run.record, ledger=LedgerState({}, 1.0, 1.0, events)))
 
 
 def mean(identity: str, value: float, reason: str = "", n: int = 4, **counts: int) -> Mapping[Identity, Mean]:

@@ -6,11 +6,12 @@ from types import SimpleNamespace
 
 import pytest
 
+from ihbench.clock.events import LeftOut
 from ihbench.document.markdown import write as markdown
 from ihbench.reports.general.ablation import write
 from ihbench.runner.ablation import AblationSuite, Comparison, Variant
 from ihbench.scene.plan import Omission
-from tests.reports.fake_runs import with_about
+from tests.reports.fake_runs import with_about, with_events
 from tests.reports.made_up_runs import made_up
 
 SCENES = tuple("abcdef")
@@ -108,3 +109,9 @@ def test_what_the_plan_left_out_of_a_rung_is_said(tmp_path):
     text, table = told({"low": variant(tmp_path, 20), "high": high})
     assert "- left out by the plan, high: levels → 64+128 in 2 of 6 runs\n" in text
     assert table["rungs"]["high"]["left_out"] == {"levels → 64+128": 2}
+
+
+def test_what_a_fit_left_out_of_a_rung_is_said(tmp_path):
+    high = [with_events(run, LeftOut("a term", "no weights")) for run in variant(tmp_path, 22)]
+    text, _ = told({"low": variant(tmp_path, 20), "high": high})
+    assert "- high: Left out by the fit: a term: no weights (all runs).\n" in text

@@ -7,12 +7,13 @@ from pathlib import Path
 
 import pytest
 
+from ihbench.clock.events import LeftOut, RolledBack, Warned
 from ihbench.clock.machine import Machine
 from ihbench.record.results import RunResult
 from ihbench.record.schema import PredictionFiles
 from ihbench.reports.general.report import MARKDOWN as write
 from ihbench.scene.plan import Omission
-from tests.reports.fake_runs import about, identity, mean, record
+from tests.reports.fake_runs import about, identity, mean, record, with_events
 
 PSNR, SSIM = "psnr/pooled/range1/{}/v1", "ssim/gauss11-1.5/range1/{}/v1"
 REGIONS = ("full", "body", "hidden")
@@ -187,7 +188,21 @@ def test_views_that_a_mean_does_not_run_over_are_counted():
 def test_what_was_left_out_is_said_once():
     left_out = (Omission("levels", [16], "too fine"),)
     text = write([run("a", left_out=left_out), run("b", left_out=left_out)])
-    assert text.count("- left out, ours on a, b: levels → [16]: too fine") == 1
+    assert text.count("- left out by the plan, ours on a, b: levels → [16]: too fine") == 1
+
+
+def test_what_a_fit_left_out_went_back_from_and_warned_of_is_said_by_row():
+    lacks = LeftOut("lpips term", "no weights")
+    back = RolledBack("stage1", 20, "loss is nan at step 31; went back to step 20", 31)
+    runs = [with_events(run("a"), lacks), with_events(run("b"), lacks, lacks), with_events(run("a", "theirs"), lacks)]
+    runs.append(with_events(run("c"), back, Warned("out of memory")))
+    runs[2] = replace(runs[2], record=replace(runs[2].record, warnings=("started again",)))
+    text = write(runs)
+    assert text.count("- left out by the fit, ours on a, b, 2 of 3 runs: lpips term: no weights\n") == 1
+    assert "- left out by the fit, theirs on a: lpips term: no weights\n" in text
+    assert f"- rolled back, ours on c, 1 of 3 runs: stage1: {back.what}\n" in text
+    assert "- warning, ours on c, 1 of 3 runs: out of memory\n" in text
+    assert "- warning, theirs on a: started again\n" in text
 
 
 def test_words_from_elsewhere_cannot_break_the_table():

@@ -6,11 +6,13 @@ import math
 
 import pytest
 
+from ihbench.clock.events import LeftOut
+from ihbench.document import csv
 from ihbench.document.document import spans
 from ihbench.reports.paper.paper_numbers import PaperRow, paper_table
 from ihbench.reports.paper.paper_table import build_frame
 from ihbench.scene.plan import Omission
-from tests.reports.fake_runs import LPIPS, PSNR, SUBJECTS, fake_run
+from tests.reports.fake_runs import LPIPS, PSNR, SUBJECTS, fake_run, with_events
 
 TABLE1, TABLE2 = paper_table("table1"), paper_table("table2")
 
@@ -37,6 +39,13 @@ def cell(table, name, group, key):
 def on_all(method, psnr, **changes):
     """Runs on four scenes whose scores differ between scenes far more than between methods."""
     return [fake_run(s, method, psnr + 5 * k + 0.01 * (k % 2), 0.9, **changes) for k, s in enumerate(SUBJECTS)]
+
+
+def footnotes(frame, table, name):
+    """What the letters at a row's name say."""
+    (row,) = [row for label, row in zip(table.labels, table.rows, strict=True) if label.name == name]
+    letters = [piece.text for piece in spans(row[0])[1:]]
+    return [frame.footnotes[letter] for letter in ", ".join(letters).split(", ") if letter]
 
 
 # ----------------------------------------------------------------------------------------------------- quoted rows
@@ -95,6 +104,22 @@ def test_stand_ins_and_real_data_never_share_a_block():
     assert {c.status for c in numbers(made)} <= {"stand-in", "absent"}
     assert {c.status for c in numbers(real)} <= {"measured", "absent"}
     assert [table.kind for table in frame.tables] == ["quoted", "quoted elsewhere", "real data", "stand-in"]
+
+
+def test_a_row_says_what_the_plan_and_the_fits_left_out_of_it():
+    left_out = (Omission("levels", [16], "too fine"),)
+    runs = [fake_run("a", said={"left_out": left_out}), fake_run("b"), *on_all("theirs", 20.0)]
+    runs = [with_events(run, LeftOut("lpips term", "no weights")) if run.method == "ours" else run for run in runs]
+    frame = build_frame(TABLE1, runs)
+    found = block(frame, "stand-in")
+    assert footnotes(frame, found, "ours") == [
+        "Left out by the plan: levels → [16] (a, 1 of 2 runs).",
+        "Left out by the fit: lpips term: no weights (all runs).",
+    ]
+    assert footnotes(frame, found, "theirs") == []
+    rows = {row["row"]: row["footnotes"] for row in csv.table_data(found, frame.footnotes)["rows"]}
+    assert rows == {"ours": footnotes(frame, found, "ours"), "theirs": [], "truth": []}
+    assert "Left out by the fit" in csv.write_cells(frame.name, frame.tables, frame.footnotes)
 
 
 @pytest.mark.parametrize(

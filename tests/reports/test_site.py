@@ -21,6 +21,7 @@ from ihbench.body.pose import BodyPose
 from ihbench.body.uv import texel_table
 from ihbench.camera import Camera, look_at
 from ihbench.clock.checkpoints import States
+from ihbench.clock.events import LeftOut, Warned
 from ihbench.clock.progress import Progress
 from ihbench.errors import BadInput
 from ihbench.files.pictures import read_rgb
@@ -125,6 +126,13 @@ def test_what_a_protocol_says_survives_as_toml():
         "of": {"rows": [1, [2, "x"]], "deeper": {"odd key!": "é", "empty": {}}}, "late": "value",
     }  # fmt: skip
     assert tomllib.loads(tables.toml(content)) == content
+
+
+def test_what_a_run_says_of_itself_is_told_by_kind():
+    run = fake_runs.with_events(fake_runs.fake_run(), LeftOut("lpips term", "no weights"), Warned("again"))
+    said = tables.site_tables([run, fake_runs.fake_run("b")])["runs"]
+    assert said[0]["remarks"] == {"left out by the fit": ["lpips term: no weights"], "warning": ["again"]}
+    assert said[1]["remarks"] == {}
 
 
 def test_a_run_that_failed_has_a_curve_alone(tmp_path):

@@ -24,8 +24,8 @@ function runAbout(run) {
     run.reason && el("p", {}, run.reason),
     el("p", {}, "Repeat it from its record:"), copyable(run.repeat),
     run.command && [el("p", {}, "It was started by:"), copyable(run.command)],
-    run.left_out.length > 0 && [el("p", {}, "The plan left out:"), el("ul", {}, run.left_out.map((o) => el("li", {}, o)))],
-    run.warnings.length > 0 && [el("p", {}, "Warnings:"), el("ul", {}, run.warnings.map((w) => el("li", {}, w)))],
+    Object.entries(run.remarks).map(([kind, said]) =>
+      [el("p", {}, `${kind[0].toUpperCase()}${kind.slice(1)}:`), el("ul", {}, said.map((text) => el("li", {}, text)))]),
     el("div", { class: "wide" }, el("table", { class: "facts" }, run.facts.map(([name, value]) =>
       el("tr", {}, el("th", { scope: "row" }, name), el("td", {}, value))))),
     el("details", {}, el("summary", {}, "every switch"), copyable(JSON.stringify(run.config, null, 2))));

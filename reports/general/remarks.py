@@ -1,0 +1,81 @@
+"""What must be said beside the numbers of some rows: why cells are empty, what means do not run over, what the plan
+and the fits themselves left out, and what else the fits warn of."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from ihbench.clock.events import LeftOut, RolledBack, Warned
+from ihbench.record.results import RunResult, grouped
+from ihbench.record.row_labels import by_label
+from ihbench.record.shareable import without_places
+
+PLAN, FIT, BACK, WARNING = "left out by the plan", "left out by the fit", "rolled back", "warning"
+
+
+def remarks(runs: Sequence[RunResult]) -> list[str]:
+    """One line for each remark on some rows' finished runs, with the rows and scenes that it is of."""
+    absent: dict[tuple[str, str], list[str]] = {}
+    partly: dict[tuple[str, str, str], list[str]] = {}
+    notes: list[str] = []
+    for run in runs:
+        for identity, mean in run.own.items():
+            metric, region = identity.display.title, identity.region
+            if mean.absent:
+                absent.setdefault((metric, mean.reason), []).append(region)
+            elif mean.note:
+                partly.setdefault((run.scene, region, mean.note), []).append(metric)
+        files = run.about.predictions
+        remarks = () if files is None else (*files.notes, *files.doubts)
+        notes += [f"{run.method} on {run.scene}: {note}" for note in remarks]
+        notes += [f"{run.method} on {run.scene}: not shown: {damage}" for damage in run.damage]
+    for label, group in by_label(runs).items():
+        for kind in (PLAN, FIT, BACK, WARNING):
+            for text, having in _runs_by_text(group, kind).items():
+                notes.append(f"{kind}, {label} on {_scenes(having)}{_share(having, group)}: {text}")
+    for (scene, region, note), metrics in partly.items():
+        notes.append(f"{region} of {scene} ({', '.join(dict.fromkeys(metrics))}): {note}")
+    for (metric, reason), regions in absent.items():
+        notes.append(f"absent: {metric}, {', '.join(dict.fromkeys(regions))}: {reason}")
+    return sorted(set(notes))
+
+
+def row_footnotes(runs: Sequence[RunResult], kinds: Sequence[str] = (PLAN, FIT, BACK)) -> list[str]:
+    """What sets a row's finished runs apart from the whole system, a sentence for each kind: what the plan and the
+    fits left out, and fits that went back to an earlier step."""
+    notes = []
+    for kind in kinds:
+        found = _runs_by_text(runs, kind, reasons=kind != PLAN)
+        parts = [f"{text} ({'all runs' if len(having) == len(runs) else _scenes(having) + _share(having, runs)})"
+                 for text, having in found.items()]  # fmt: skip
+        notes += [f"{kind.capitalize()}: {'; '.join(parts)}."] if parts else []
+    return notes
+
+
+def said_by(run: RunResult, reasons: bool = True) -> Mapping[str, list[str]]:
+    """Kind of remark -> what the record says, in words, each thing once; with `reasons`, why the plan left it out. No
+    text names a place of the machine that made the run."""
+    said: dict[str, list[str]] = {PLAN: [], FIT: [], BACK: [], WARNING: [*run.record.warnings]}
+    for o in run.about.left_out or ():
+        said[PLAN].append(f"{o.field} → {o.value}" + (f": {o.reason}" if reasons else ""))
+    for event in run.record.events:
+        what, reason, stage = (str(event.data.get(name, "")) for name in ("what", "reason", "stage"))
+        if event.kind == LeftOut.kind:
+            said[FIT].append(f"{what}: {reason}" if reason else what)
+        elif event.kind == RolledBack.kind:
+            said[BACK].append(f"{stage}: {what}")
+        elif event.kind == Warned.kind:
+            said[WARNING].append(what)
+    return {kind: list(dict.fromkeys(without_places(t, run.folder) for t in texts)) for kind, texts in said.items()}
+
+
+def _runs_by_text(runs: Sequence[RunResult], kind: str, reasons: bool = True) -> dict[str, list[RunResult]]:
+    return grouped((text, run) for run in runs for text in said_by(run, reasons)[kind])
+
+
+def _scenes(runs: Sequence[RunResult]) -> str:
+    return ", ".join(sorted({run.scene for run in runs}))
+
+
+def _share(having: Sequence[RunResult], of: Sequence[RunResult]) -> str:
+    return f", {len(having)} of {len(of)} runs" if len(having) < len(of) else ""
