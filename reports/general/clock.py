@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from ihbench.clock.machine import BUSY
 from ihbench.document.document import Words
 from ihbench.record.results import RunResult, grouped
 from ihbench.record.row_labels import by_label
+from ihbench.record.scene_means import seed_means
 
 UNSTABLE = 0.25  # repeats further apart than this share of their median are called unstable, as in `ihbench kernels`
 
@@ -50,6 +52,13 @@ def machine_name(run: RunResult) -> str:
 def one_clock(runs: Sequence[RunResult]) -> bool:
     """Whether seconds of these runs may be averaged."""
     return len({machine_name(run) for run in runs}) <= 1
+
+
+def mean_cost(runs: Sequence[RunResult], cost: Callable[[RunResult], float | None]) -> float | None:
+    """What these runs cost in seconds or milliseconds, as scores are averaged: the mean over the seeds of a scene,
+    then over scenes. None where no run says it, and for runs of several machines."""
+    known = seed_means((run.scene, value) for run in runs if (value := cost(run)) is not None)
+    return math.fsum(known.values()) / len(known) if known and one_clock(runs) else None
 
 
 def unstable(runs: Sequence[RunResult]) -> list[str]:

@@ -3,7 +3,7 @@ error against run time, what was painted, intervals and paired tests."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,7 +26,7 @@ from ihbench.metrics import Identity
 from ihbench.record.quality_time import Target
 from ihbench.record.results import RunResult, by_group
 from ihbench.record.row_labels import by_label
-from ihbench.reports.general.clock import one_clock
+from ihbench.reports.general.clock import mean_cost
 from ihbench.reports.general.inpainting import inpainting_section
 from ihbench.reports.general.ledger_table import ledger_section
 from ihbench.reports.general.remarks import remarks
@@ -118,7 +118,10 @@ def _group(runs: list[RunResult], presets: Sequence[str], targets: Sequence[Targ
             first = metric == identities[0].metric
             blocks.append(_table(done, columns, headline, with_costs=first))
     scenes = ", ".join(sorted({run.scene for run in done}))
-    note = f"Mean over test views of a scene, then over scenes ({scenes}). Headline region: {headline}."
+    note = (
+        f"Mean over test views of a scene, then over scenes ({scenes}); of seconds and render ms, over the seeds of "
+        f"a scene, then over scenes; peak MB is the largest. Headline region: {headline}."
+    )
     blocks.append(Paragraph(note))
     blocks += _definitions(identities)
     present = [row for row in ROWS if any(row in run.rows for run in done)]
@@ -188,10 +191,9 @@ def _table(
         about = (str(len({r.scene for r in group})), ", ".join(sorted({str(r.seed) for r in group})))
         own: list[str] = []
         if with_costs:
-            alike = one_clock(group)  # seconds of several machines have no mean
-            own = [_mean_of(group, name) if alike else "—" for name in ("fit_seconds", "total_seconds")]
+            own = [_cost(group, lambda run: run.about.fit_seconds), _cost(group, lambda run: run.about.total_seconds)]
             own.append(f"{max(run.about.peak_mb or 0.0 for run in group):.0f}")
-            own.append(_mean_of(group, "render_ms", "{:.3g}") if alike else "—")
+            own.append(_cost(group, lambda run: run.about.render_ms, "{:.3g}"))
         lines.append((label, *about, *score_cells(group, columns, method), *own))
         for row in further_rows(group):
             name = label + row.removeprefix(method)
@@ -205,6 +207,6 @@ def _table(
     return Table(tuple(head), tuple(lines), left=3)
 
 
-def _mean_of(runs: list[RunResult], key: str, shown: str = "{:.0f}") -> str:
-    known = [value for run in runs if (value := getattr(run.about, key)) is not None]
-    return shown.format(sum(known) / len(known)) if known else "—"
+def _cost(runs: list[RunResult], cost: Callable[[RunResult], float | None], shown: str = "{:.0f}") -> str:
+    mean = mean_cost(runs, cost)
+    return "—" if mean is None else shown.format(mean)

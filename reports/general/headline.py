@@ -12,7 +12,7 @@ from ihbench.errors import visible
 from ihbench.metrics import Identity
 from ihbench.record.results import TRACEBACK, NotRun, RunResult, by_group
 from ihbench.record.row_labels import by_label
-from ihbench.reports.general.clock import one_clock
+from ihbench.reports.general.clock import mean_cost
 from ihbench.reports.general.significance import further_rows, score_cells
 from ihbench.scoring.calibration import ROWS
 
@@ -139,11 +139,10 @@ def _rows(done: Sequence[RunResult], identities: Sequence[Identity]) -> list[tup
 
 def _costs(runs: Sequence[RunResult]) -> list[str]:
     """Of `COSTS`: "—" for seconds that have no mean, nothing for milliseconds of which there are none."""
-    seconds = [run.fit_seconds for run in runs if run.timed]
-    drawing = [ms for run in runs if (ms := run.about.render_ms) is not None]
-    alike = one_clock(runs)
-    fit = f"{sum(seconds) / len(seconds):.0f}" if seconds and alike else "—"
-    return [fit, f"{sum(drawing) / len(drawing):.3g}" if drawing and alike else ""]
+    seconds, drawing = (
+        mean_cost(runs, of) for of in (lambda run: run.about.fit_seconds, lambda run: run.about.render_ms)
+    )
+    return ["—" if seconds is None else f"{seconds:.0f}", "" if drawing is None else f"{drawing:.3g}"]
 
 
 def _cut(name: str, room: int) -> str:

@@ -98,7 +98,7 @@ def _table(columns: dict[str, list[Account]]) -> Table:
     lines += [(emphasis(UNNAMED), *unnamed), (strong(TOTAL), *total)]
     head: list[Words] = ["stage"]
     for label, accounts in columns.items():
-        head += [f"{label}: s (mean of {len(accounts)})", "%"]
+        head += [f"{label}: s (mean of {len(accounts)} run{'s' * (len(accounts) > 1)})", "%"]
     return Table(tuple(head), tuple(lines))
 
 

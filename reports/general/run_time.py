@@ -28,7 +28,7 @@ from ihbench.record.quality_time import (
 )
 from ihbench.record.results import RunResult, grouped
 from ihbench.record.scene_means import per_scene, seed_means
-from ihbench.reports.general.clock import clock_notes
+from ihbench.reports.general.clock import clock_notes, mean_cost
 from ihbench.reports.general.configurations import Configuration, configurations
 from ihbench.reports.general.significance import LEVEL, interval_text
 
@@ -178,7 +178,7 @@ def _cost_table(configs: Sequence[Configuration], identities: Sequence[Identity]
             f"{seconds_interval(c.runs, 'total_seconds').value:.0f}",
             f"{max(run.about.peak_mb or 0.0 for run in c.runs):.0f}",
             *([f"{max(map(_device_mb, c.runs)):.0f}"] if on_gpu else []),
-            _render_ms(c.runs),
+            "—" if (drawing := mean_cost(c.runs, lambda run: run.about.render_ms)) is None else f"{drawing:.3g}",
             *(i.display.text(row[c.label].value.value) if c.label in row else "—" for i, row in points.items()),
             ", ".join(best.get(c.label, [])) or "—",
         ]
@@ -189,7 +189,8 @@ def _cost_table(configs: Sequence[Configuration], identities: Sequence[Identity]
     note = (
         f"Region {headline}, {len(scenes)} scene{'s' if len(scenes) > 1 else ''} that all these rows have. The fit "
         "clock stands still while checkpoints are scored and states are saved; total s is the whole run; render ms "
-        "is one test view, the median. Pareto: by these means no other row is as fast and better in this metric."
+        "is one test view, the median; peak MB is the largest. Pareto: by these means no other row is as fast and "
+        "better in this metric."
     )
     note += f" Not here, because they lack some of these scenes: {'; '.join(labels)}." if labels else ""
     note += f" Intervals: {'; '.join(kinds)}." if kinds else ""
@@ -333,12 +334,6 @@ def _area_table(configs: Sequence[Configuration], views: str, known: Sequence[Id
     )
     title = f"Area under the quality-time curve, on {views} test views"
     return [Heading(3, title), Table(tuple(head), tuple(map(tuple, cells.values()))), Paragraph(note)]
-
-
-def _render_ms(runs: Sequence[RunResult]) -> str:
-    """Mean over scenes of the median over test views; runs of earlier versions do not say."""
-    known = grouped((run.scene, ms) for run in runs if (ms := run.about.render_ms) is not None)
-    return f"{np.mean([np.mean(values) for values in known.values()]):.3g}" if known else "—"
 
 
 def _seconds(value: float, unit: str = " s") -> str:

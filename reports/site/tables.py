@@ -20,7 +20,7 @@ from ihbench.record.row_labels import by_label
 from ihbench.record.scene_means import per_scene, scene_means
 from ihbench.record.schema import ScoreLine, score_lines
 from ihbench.record.shareable import without_places
-from ihbench.reports.general.clock import machine_name, one_clock
+from ihbench.reports.general.clock import machine_name, mean_cost
 from ihbench.reports.general.remarks import said_by
 from ihbench.reports.general.significance import LEVEL, further_rows
 from ihbench.scene.method_spec import usable_specs
@@ -148,11 +148,6 @@ def _row(
     shared = {}
     if common is not None:
         shared["common"], shared["common_intervals"] = _means(_on(runs, common), identities, name)
-    seconds = {
-        key: [value for run in runs if (value := getattr(run.about, f"{key}_seconds")) is not None]
-        for key in ("fit", "total")
-    }
-    alike = one_clock(runs)
     return {
         "label": label,
         "method": runs[0].method,
@@ -164,7 +159,8 @@ def _row(
         "by_scene": scenes,
         "intervals": intervals,
         **shared,
-        **{key: sum(found) / len(found) if found and alike else None for key, found in seconds.items()},
+        "fit": mean_cost(runs, lambda run: run.about.fit_seconds),
+        "total": mean_cost(runs, lambda run: run.about.total_seconds),
         "peak": max((run.about.peak_mb or 0.0 for run in runs), default=0.0),
     }
 

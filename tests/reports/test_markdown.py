@@ -11,7 +11,9 @@ from ihbench.clock.events import LeftOut, RolledBack, Warned
 from ihbench.clock.machine import Machine
 from ihbench.record.results import RunResult
 from ihbench.record.schema import PredictionFiles
+from ihbench.reports.general.headline import write as headline
 from ihbench.reports.general.report import MARKDOWN as write
+from ihbench.reports.site.tables import site_tables
 from ihbench.scene.plan import Omission
 from tests.reports.fake_runs import about, identity, mean, record, with_events
 
@@ -132,6 +134,23 @@ def test_calibration_rows_count_every_scene_once_and_stand_below_the_methods():
     assert [cells["method"] for cells in rows] == ["ours", "theirs", "*truth*"]
     assert row(text, "*truth*")["scenes"] == "2"
     assert "- truth: the truth as prediction" in text
+
+
+def test_every_scene_counts_once_in_the_costs_too():
+    """In every table: two seeds of one scene are one scene."""
+    costs = (("a", 0, 10, 1), ("a", 1, 30, 3), ("b", 0, 60, 6))
+    runs = [
+        run(scene, seed=seed, fit_seconds=fit, total_seconds=2 * fit, render_ms=ms) for scene, seed, fit, ms in costs
+    ]
+    rows = [cells for table in tables(write(runs)).values() for cells in table if cells.get("method") == "ours"]
+    found = [cells for cells in rows if "render ms" in cells]
+    assert len(found) == 2
+    for cells in found:
+        (fit,) = [text for head, text in cells.items() if head.startswith("fit s")]
+        assert (fit.split(" [")[0], cells["total s"], cells["render ms"]) == ("40", "80", "4")
+    (ours, *_) = site_tables(runs)["groups"][0]["rows"]
+    assert (ours["fit"], ours["total"]) == (40, 80)
+    assert re.search(r"^ours .* 40 +4$", headline(runs), re.M)
 
 
 def test_seconds_are_means_and_memory_is_the_largest():

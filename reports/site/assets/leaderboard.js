@@ -33,8 +33,9 @@ function leaderboardTab(group) {
       group.common.length > 0 && toggle("only scenes that all have", board.shared, (on) => { board.shared = on; show(); })),
     el("div", { class: "wide" }, boardTable(group, columns)),
     el("p", { class: "note" },
-      `Mean over test views of a scene, then over scenes. Headline region: ${group.headline}. Brackets: 95% interval `
-      + "over scenes. Bold is best, underlined second, only where the intervals allow it. Grey rows bound every "
+      "Mean over test views of a scene, then over scenes; of seconds, over the seeds of a scene, then over scenes; peak "
+      + `MB is the largest. Headline region: ${group.headline}. Brackets: 95% interval over scenes. Bold is best, `
+      + "underlined second, only where the intervals allow it. Grey rows bound every "
       + "method from above and below. A number opens the test views behind it."),
     Object.entries(group.absent).length > 0 && el("details", {}, el("summary", {}, "Absent numbers"),
       el("ul", {}, Object.entries(group.absent).map(([name, why]) => el("li", {}, el("code", {}, name), `: ${why}`)))),
