@@ -16,7 +16,7 @@ from ihbench.metrics.identity import Metric
 from ihbench.metrics.statistics import Interval, holm, mean_interval, paired_test
 from ihbench.record.results import RunResult, grouped
 from ihbench.record.scene_means import per_scene, seed_means
-from ihbench.reports.general.clock import clock_notes, one_clock
+from ihbench.reports.general.clock import clock_notes, one_clock, positive_interval
 from ihbench.reports.general.content import data_words
 from ihbench.reports.general.remarks import BACK, FIT, row_footnotes
 from ihbench.reports.general.significance import ALPHA, LEVEL
@@ -72,7 +72,8 @@ def _table(suite: AblationSuite, protocol: str, cells: Found) -> tuple[list[Bloc
         having = runs[variant.name]
         asked = sum(name == variant.name for name, _ in cells)
         scores = {i: _interval(per_scene(having, i)) for i in columns}
-        seconds = _interval(_seconds(having)) if one_clock(having) else None
+        spent = _seconds(having) if one_clock(having) else {}
+        seconds = positive_interval(spent, LEVEL) if spent else None
         cells_shown = [_shown(scores[i], i.display) for i in columns] + [
             "—" if seconds is None else f"{seconds.value:.0f}"
         ]

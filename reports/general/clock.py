@@ -5,13 +5,17 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
+from ihbench.clock.ledger import FIT
 from ihbench.clock.machine import BUSY
 from ihbench.document.document import Words
+from ihbench.metrics.statistics import BOOTSTRAP_FROM, Interval, mean_interval
 from ihbench.record.results import RunResult, grouped
 from ihbench.record.row_labels import by_label
 from ihbench.record.scene_means import seed_means
 
+WAITED = 1.5  # a fit that took more than this times its processor seconds stood still for a part of them
 UNSTABLE = 0.25  # repeats further apart than this share of their median are called unstable, as in `ihbench kernels`
 
 
@@ -61,9 +65,39 @@ def mean_cost(runs: Sequence[RunResult], cost: Callable[[RunResult], float | Non
     return math.fsum(known.values()) / len(known) if known and one_clock(runs) else None
 
 
+def positive_interval(seconds: Mapping[str, float | Sequence[float]], level: float) -> Interval:
+    """`mean_interval` of seconds, which are positive: Student's t is taken of the mean's logarithm (its deviation is
+    that of the mean over the mean), so that no end lies below zero. Resampling needs no logarithm."""
+    interval = mean_interval(seconds, level)
+    if not (interval.value > 0 and math.isfinite(interval.low) and interval.n < BOOTSTRAP_FROM):
+        return interval
+    low, high = (interval.value * math.exp(end / interval.value - 1) for end in (interval.low, interval.high))
+    return replace(interval, low=low, high=high, method=f"{interval.method}, of seconds in their logarithm")
+
+
+def fit_cpu_seconds(run: RunResult) -> float | None:
+    """What the processor did for the fit, seconds of all its threads together; None where the record does not say,
+    and for a fit on a GPU, of which it says nothing."""
+    stages = {} if run.record.ledger is None else run.record.ledger.stages
+    seconds = stages[FIT].cpu_seconds if FIT in stages and run.about.device == "cpu" else 0.0
+    return seconds or None
+
+
+def waited(runs: Sequence[RunResult]) -> str:
+    """How many fits stood still while their clock went on, as one does that was stopped or shared its processor:
+    "2 of 6 fits waited: up to 845 s, of which the process ran 54 s"; "" for none. Threads work at the same time: of a
+    fit with several that waited not all is noticed."""
+    timed = [(run.fit_seconds, cpu) for run in runs if run.timed and (cpu := fit_cpu_seconds(run)) is not None]
+    found = [(seconds, cpu) for seconds, cpu in timed if seconds > WAITED * cpu]
+    if not found:
+        return ""
+    seconds, cpu = max(found)
+    return f"{len(found)} of {len(runs)} fits waited: up to {seconds:.0f} s, of which the process ran {cpu:.0f} s"
+
+
 def unstable(runs: Sequence[RunResult]) -> list[str]:
     """Why the seconds of these runs (one row of a table) are unstable; nothing when they are not known to be."""
-    reasons = []
+    reasons = [words] if (words := waited(runs)) else []
     apart = max(map(_spread, grouped((run.scene, run.fit_seconds) for run in runs).values()), default=0.0)
     if apart > UNSTABLE:
         reasons.append(f"repeats {apart:.0%} of their median apart")

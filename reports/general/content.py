@@ -26,7 +26,7 @@ from ihbench.metrics import Identity
 from ihbench.record.quality_time import Target
 from ihbench.record.results import RunResult, by_group
 from ihbench.record.row_labels import by_label
-from ihbench.reports.general.clock import mean_cost
+from ihbench.reports.general.clock import fit_cpu_seconds, mean_cost
 from ihbench.reports.general.inpainting import inpainting_section
 from ihbench.reports.general.ledger_table import ledger_section
 from ihbench.reports.general.remarks import remarks
@@ -183,7 +183,8 @@ def _table(
         f"{name} ({i.variant})" if names.count(name) > 1 else name for i, name in zip(columns, names, strict=True)
     ]
     titles: list[Words] = [strong(t) if i.region == headline else t for i, t in zip(columns, names, strict=True)]
-    costs = ["fit s", "total s", "peak MB", "render ms"] if with_costs else []
+    of_cpu = any(fit_cpu_seconds(run) is not None for run in runs)
+    costs = ["fit s", *(["fit CPU s"] if of_cpu else []), "total s", "peak MB", "render ms"] if with_costs else []
     head: list[Words] = ["method", "scenes", "seeds", *titles, *costs]
     lines: list[tuple[Words, ...]] = []
     for label, group in by_label(runs).items():
@@ -191,7 +192,9 @@ def _table(
         about = (str(len({r.scene for r in group})), ", ".join(sorted({str(r.seed) for r in group})))
         own: list[str] = []
         if with_costs:
-            own = [_cost(group, lambda run: run.about.fit_seconds), _cost(group, lambda run: run.about.total_seconds)]
+            own = [_cost(group, lambda run: run.about.fit_seconds)]
+            own += [_cost(group, fit_cpu_seconds)] if of_cpu else []
+            own.append(_cost(group, lambda run: run.about.total_seconds))
             own.append(f"{max(run.about.peak_mb or 0.0 for run in group):.0f}")
             own.append(_cost(group, lambda run: run.about.render_ms, "{:.3g}"))
         lines.append((label, *about, *score_cells(group, columns, method), *own))

@@ -20,6 +20,7 @@ from ihbench.record import outputs
 from ihbench.record.quality_time import QualityCurve, error_of
 from ihbench.record.results import RunResult, by_group, grouped
 from ihbench.record.schema import plain_name
+from ihbench.reports.general.clock import fit_cpu_seconds, mean_cost, waited
 from ihbench.reports.general.configurations import Configuration, configurations, short_value, sweeps
 from ihbench.reports.general.run_time import (
     LEVEL,
@@ -95,7 +96,7 @@ def _work_precision(
         f"logarithmic; bars are {LEVEL:.0%} intervals over scenes, or over repeats of a single one, and "
         "may run out of the picture."
     )
-    return _diagram(panels, scenes, path, f"Work-precision: {title}", about, caption)
+    return _diagram(panels, scenes, path, f"Work-precision: {title}", about, caption + _waited(configs))
 
 
 def _systems(
@@ -111,7 +112,7 @@ def _systems(
         "both logarithmic. The dashed line is the Pareto set of a region: nothing is as fast and better. Bars are "
         f"{LEVEL:.0%} intervals over scenes, and may run out of the picture."
     )
-    return _diagram(panels, scenes, path, f"Systems: {title}", about, caption, named=True)
+    return _diagram(panels, scenes, path, f"Systems: {title}", about, caption + _waited(configs), named=True)
 
 
 def _panels(
@@ -234,6 +235,7 @@ def _csv_row(p: WorkPoint, identity: Identity, on_front: bool, scenes: int) -> d
         "scenes": scenes,
         "runs": len(c.runs),
         **_ends("fit_seconds", p.seconds),
+        "fit_cpu_seconds": math.nan if (cpu := mean_cost(c.runs, fit_cpu_seconds)) is None else cpu,
         "total_seconds": seconds_interval(c.runs, "total_seconds").value,
         "identity": str(identity),
         **_ends("value", p.value),
@@ -278,7 +280,7 @@ def _quality_time(
     crowd = f"; dots: checkpoints of single runs; shaded: {LEVEL:.0%} interval" if len(configs) <= CROWD else ""
     caption = (
         f"Quality against the fit clock, {title} ({about}), by region, on {views} test views. Lines: mean over "
-        f"scenes of the checkpoints of their runs{crowd}. Scoring does not count as time."
+        f"scenes of the checkpoints of their runs{crowd}. Scoring does not count as time.{_waited(configs)}"
     )
     return [(outputs.write_files(path, diagram.files(drawn, rows)), caption)]
 
@@ -339,6 +341,12 @@ def _mean_curve(found: dict[tuple[str, int], QualityCurve]) -> list[list[float]]
 
 
 # ------------------------------------------------------------------------------------------------------------- shared
+
+
+def _waited(configs: Sequence[Configuration]) -> str:
+    """What a caption says of fits that stood still for a part of their seconds."""
+    words = waited([run for c in configs for run in c.runs])
+    return f" {words}: drawn by the wall clock." if words else ""
 
 
 def _name_axes(panel: Axes, identity: Identity, below: str, where: str = "") -> None:

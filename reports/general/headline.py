@@ -12,7 +12,7 @@ from ihbench.errors import visible
 from ihbench.metrics import Identity
 from ihbench.record.results import TRACEBACK, NotRun, RunResult, by_group
 from ihbench.record.row_labels import by_label
-from ihbench.reports.general.clock import mean_cost
+from ihbench.reports.general.clock import mean_cost, waited
 from ihbench.reports.general.significance import further_rows, score_cells
 from ihbench.scoring.calibration import ROWS
 
@@ -78,6 +78,7 @@ def headline_section(results: Sequence[RunResult]) -> list[Block]:
         note = (
             f"{protocol}, {profile} profile, {data}; region {headline}, mean over test views of {', '.join(scenes)}."
         )
+        note += f" {words}." if (words := waited(runs)) else ""
         blocks += [Paragraph(note), Table(head, rows)]
     return [Heading(2, "Headline"), *blocks] if blocks else []
 
@@ -117,6 +118,7 @@ def _group(runs: Sequence[RunResult], width: int, not_run: Sequence[str]) -> lis
     scenes = sorted({run.scene for run in done})
     note = f"mean over test views of {', '.join(scenes) if len(scenes) <= SHOWN else f'{len(scenes)} scenes'}"
     note += f"; not shown: {', '.join(absent)}" if absent else ""
+    note += f"; {words}" if (words := waited(done)) else ""
     reasons = dict.fromkeys(
         means[i].reason for i in in_headline if i not in present for means in own if i in means and means[i].reason
     )

@@ -28,7 +28,7 @@ from ihbench.record.quality_time import (
 )
 from ihbench.record.results import RunResult, grouped
 from ihbench.record.scene_means import per_scene, seed_means
-from ihbench.reports.general.clock import clock_notes, mean_cost
+from ihbench.reports.general.clock import clock_notes, fit_cpu_seconds, mean_cost, positive_interval, waited
 from ihbench.reports.general.configurations import Configuration, configurations
 from ihbench.reports.general.significance import LEVEL, interval_text
 
@@ -84,10 +84,11 @@ def pareto(points: Iterable[WorkPoint]) -> list[int]:
 
 
 def seconds_interval(runs: Sequence[RunResult], key: str = "fit_seconds") -> Interval:
-    """Mean seconds with its interval: over scenes (each the mean of its repeats), or over repeats of one scene."""
+    """Mean seconds with its interval, see `positive_interval`: over scenes (each the mean of its repeats), or over
+    repeats of one scene."""
     seconds = grouped((run.scene, float(getattr(run.about, key))) for run in runs)
     repeats = {str(k): value for k, value in enumerate(next(iter(seconds.values())))}
-    return mean_interval(seconds if len(seconds) > 1 else repeats, LEVEL)
+    return positive_interval(seconds if len(seconds) > 1 else repeats, LEVEL)
 
 
 def curves(configuration: Configuration, identity: Identity) -> dict[tuple[str, int], QualityCurve]:
@@ -166,7 +167,9 @@ def _cost_table(configs: Sequence[Configuration], identities: Sequence[Identity]
     }
     points = {i: row for i, row in points.items() if row}
     best = grouped(([*row][k], i.display.title) for i, row in points.items() for k in pareto(row.values()))
-    on_gpu = any(_device_mb(run) > 0 for c in configs for run in c.runs)
+    every = [run for c in configs for run in c.runs]
+    on_gpu = any(_device_mb(run) > 0 for run in every)
+    of_cpu = any(fit_cpu_seconds(run) is not None for run in every)
     seconds = {c.label: seconds_interval(c.runs) for c in configs}
     rows: list[tuple[Words, ...]] = []
     for c in configs:
@@ -175,16 +178,18 @@ def _cost_table(configs: Sequence[Configuration], identities: Sequence[Identity]
             c.label,
             str(len(c.runs)),
             interval_text(seconds[c.label], "{:.3g}".format),
+            *([_shown(mean_cost(c.runs, fit_cpu_seconds), "{:.3g}")] if of_cpu else []),
             f"{seconds_interval(c.runs, 'total_seconds').value:.0f}",
             f"{max(run.about.peak_mb or 0.0 for run in c.runs):.0f}",
             *([f"{max(map(_device_mb, c.runs)):.0f}"] if on_gpu else []),
-            "—" if (drawing := mean_cost(c.runs, lambda run: run.about.render_ms)) is None else f"{drawing:.3g}",
+            _shown(mean_cost(c.runs, lambda run: run.about.render_ms), "{:.3g}"),
             *(i.display.text(row[c.label].value.value) if c.label in row else "—" for i, row in points.items()),
             ", ".join(best.get(c.label, [])) or "—",
         ]
         rows.append(tuple(cells))
     kinds = sorted({interval.method for interval in seconds.values() if math.isfinite(interval.low)})
-    head = ["method", "runs", f"fit s [{SPREAD}]" if kinds else "fit s", "total s", "peak MB"]
+    head = ["method", "runs", f"fit s [{SPREAD}]" if kinds else "fit s", *(["fit CPU s"] if of_cpu else [])]
+    head += ["total s", "peak MB"]
     head += [*(["GPU MB"] if on_gpu else []), "render ms", *(i.display.head() for i in points), "Pareto"]
     note = (
         f"Region {headline}, {len(scenes)} scene{'s' if len(scenes) > 1 else ''} that all these rows have. The fit "
@@ -194,6 +199,11 @@ def _cost_table(configs: Sequence[Configuration], identities: Sequence[Identity]
     )
     note += f" Not here, because they lack some of these scenes: {'; '.join(labels)}." if labels else ""
     note += f" Intervals: {'; '.join(kinds)}." if kinds else ""
+    note += " Fit CPU s is what the processor did of it, all threads together." if of_cpu else ""
+    if words := waited(every):
+        note += (
+            f" {words}. Their seconds of the wall clock count in Pareto sets, times, areas and diagrams all the same."
+        )
     return [Table(tuple(head), tuple(rows)), Paragraph(note)]
 
 
@@ -334,6 +344,10 @@ def _area_table(configs: Sequence[Configuration], views: str, known: Sequence[Id
     )
     title = f"Area under the quality-time curve, on {views} test views"
     return [Heading(3, title), Table(tuple(head), tuple(map(tuple, cells.values()))), Paragraph(note)]
+
+
+def _shown(cost: float | None, form: str) -> str:
+    return "—" if cost is None else form.format(cost)
 
 
 def _seconds(value: float, unit: str = " s") -> str:

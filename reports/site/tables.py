@@ -20,7 +20,7 @@ from ihbench.record.row_labels import by_label
 from ihbench.record.scene_means import per_scene, scene_means
 from ihbench.record.schema import ScoreLine, score_lines
 from ihbench.record.shareable import without_places
-from ihbench.reports.general.clock import machine_name, mean_cost
+from ihbench.reports.general.clock import fit_cpu_seconds, machine_name, mean_cost, unstable
 from ihbench.reports.general.remarks import said_by
 from ihbench.reports.general.significance import LEVEL, further_rows
 from ihbench.scene.method_spec import usable_specs
@@ -123,7 +123,10 @@ def _rows(
     for name in ROWS:
         if having := [run for run in done if name in run.rows]:
             row = _row(name, having, identities, name, numbers, common)
-            rows.append(row | {"kind": "bound", "marks": {}, "about": DESCRIPTIONS[name], "fit": None, "total": None})
+            rows.append(
+                row
+                | {"kind": "bound", "marks": {}, "about": DESCRIPTIONS[name], "fit": None, "cpu": None, "total": None}
+            )
     return rows
 
 
@@ -160,7 +163,9 @@ def _row(
         "intervals": intervals,
         **shared,
         "fit": mean_cost(runs, lambda run: run.about.fit_seconds),
+        "cpu": mean_cost(runs, fit_cpu_seconds),
         "total": mean_cost(runs, lambda run: run.about.total_seconds),
+        "unstable": unstable([run for run in runs if run.timed]),
         "peak": max((run.about.peak_mb or 0.0 for run in runs), default=0.0),
     }
 

@@ -55,7 +55,7 @@ def stop_clock(folder: Path) -> str:
     record = json.loads((folder / "run.json").read_text(encoding="utf-8"))
     stages = record["ledger"]["stages"]
     for path, stage in stages.items():
-        stage |= {"seconds": 0.5 if "/" in path else 2.0, "cpu_seconds": 1.0, "peak_mb": 100.0}
+        stage |= {"seconds": 0.5 if "/" in path else 2.0, "cpu_seconds": 1.5, "peak_mb": 100.0}
     total = sum(stage["seconds"] for path, stage in stages.items() if "/" not in path) + 0.25
     record["ledger"] |= {"seconds": total, "events": []}
     record["about"] |= {"fit_seconds": stages["fit"]["seconds"], "total_seconds": total}

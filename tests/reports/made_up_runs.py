@@ -43,6 +43,7 @@ def made_up(
     events=(),
     views=3,  # test views that the curve stands on
     of=None,  # of how many; None as runs of earlier versions, which do not say
+    cpu=None,  # s that the processor worked on the fit; None as runs that do not say
     render_ms=None,  # None as runs of earlier versions, which do not say
     stamped=None,  # s between the record's time stamps; None agrees with the ledger
 ) -> RunResult:
@@ -74,6 +75,7 @@ def made_up(
             means |= mean(identity, value, "" if math.isfinite(value) else "nothing there")
     spent = {"load": 1.0, "fit": fit, "fit/stage1": fit - 1.0, "evaluate": 3.0, "score": 2.0, **(stages or {})}
     wall = sum(s for path_, s in spent.items() if "/" not in path_) + unnamed
+    costs = {path_: Stage(s, cpu or 0.0 if path_ == "fit" else 0.0) for path_, s in spent.items()}
     took = timedelta(seconds=round(wall if stamped is None else stamped))
     who = RunIdentity(
         protocol, f"{protocol}{profile}{size}", "d", scene, "x", method, config or {}, profile, seed, "0", "1"
@@ -85,7 +87,7 @@ def made_up(
     told = replace(
         record(who, said, machine=replace(QUIET, **(machine or {}))),
         outcome=Outcome("done", "", created=BEGAN.isoformat(), updated=(BEGAN + took).isoformat()),
-        ledger=LedgerState({path_: Stage(s) for path_, s in spent.items()}, wall, 0.0, tuple(events)),
+        ledger=LedgerState(costs, wall, 0.0, tuple(events)),
     )
     points = curve_points(path / "curve.jsonl") if curve is not None else []
     return RunResult(path, told, {method: means}, curve=points)

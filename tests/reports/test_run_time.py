@@ -15,9 +15,11 @@ from ihbench.metrics.statistics import Interval
 from ihbench.record.quality_time import Target
 from ihbench.reports.general.configurations import configurations, sweeps
 from ihbench.reports.general.figures import ROOM, _shown, draw
+from ihbench.reports.general.headline import write as headline
 from ihbench.reports.general.report import HTML, LATEX
 from ihbench.reports.general.report import MARKDOWN as write
-from ihbench.reports.general.run_time import across_sizes_section, run_time_section, work_points
+from ihbench.reports.general.run_time import across_sizes_section, run_time_section, seconds_interval, work_points
+from ihbench.reports.site.tables import site_tables
 from tests.reports.fake_runs import with_about
 from tests.reports.made_up_runs import FLIP, PSNR, made_up, sweep
 
@@ -49,6 +51,18 @@ def test_seconds_are_means_over_scenes_with_an_interval_and_one_scene_takes_its_
     repeats = [made_up(tmp_path, fit=f, seed=k) for k, f in enumerate((38, 40, 42))]
     assert re.fullmatch(r"40 \[35(\.\d)?, 45(\.\d)?\]", cells(section(repeats), "ours")["fit s [95%]"])
     assert cells(section(repeats[:1]), "ours")["fit s"] == "38"
+
+
+def test_no_interval_of_seconds_goes_below_zero(tmp_path):
+    runs = [made_up(tmp_path, scene, fit=fit) for scene, fit in (("a", 50), ("b", 60), ("c", 845))]
+    interval = seconds_interval(runs)
+    assert 0 < interval.low < interval.value < interval.high
+    assert interval.value == pytest.approx(955 / 3)
+    assert "of seconds in their logarithm" in section(runs)
+    near = seconds_interval(
+        [made_up(tmp_path, scene, fit=fit) for scene, fit in (("a", 50.0), ("b", 50.1), ("c", 50.2))]
+    )
+    assert (near.low, near.high) == pytest.approx((49.85, 50.35), abs=0.01)  # as Student's t has it
 
 
 def test_render_ms_is_the_mean_over_scenes_of_those_that_say(tmp_path):
@@ -120,6 +134,27 @@ def test_unstable_is_said_when_repeats_or_the_load_say_so_and_only_then(tmp_path
         assert "unstable seconds: 1 of 1 runs on a busy machine (load up to 2.2 per core): ours" in section(busy)
     pinned = [made_up(tmp_path, machine={"load_average_end": (4.0, 1.0, 1.0), "cores_usable": 1})]
     assert "unstable" not in section(pinned)  # the load is the whole machine's
+
+
+def test_a_fit_that_waited_is_told_and_its_processor_seconds_stand_beside_it(tmp_path):
+    runs = [made_up(tmp_path, scene, fit=fit, cpu=40) for scene, fit in (("a", 44), ("b", 840), ("c", 70))]
+    text = section(runs)
+    assert cells(text, "ours")["fit CPU s"] == "40"
+    told = "2 of 3 fits waited: up to 840 s, of which the process ran 40 s"
+    assert f"unstable seconds: {told}: ours" in text
+    assert f"{told}. Their seconds of the wall clock count in Pareto sets" in text
+    assert all(f"{told}: drawn by the wall clock." in caption for _, caption in draw(runs, tmp_path / "figures"))
+    assert told in " ".join(headline(runs).split())
+    (row,) = site_tables(runs)["groups"][0]["rows"]
+    assert (row["cpu"], row["unstable"]) == (40, [told])
+
+
+def test_threads_and_accelerators_do_not_wait(tmp_path):
+    """Several threads together have more processor seconds than the clock; on a GPU these say nothing."""
+    for cpu, device in ((150, "cpu"), (1, "cuda"), (None, "cpu")):
+        text = section([made_up(tmp_path, scene, fit=44, cpu=cpu, device=device) for scene in "abc"])
+        assert "waited" not in text
+        assert ("fit CPU s" in text) == (cpu == 150)
 
 
 def test_runs_without_a_fit_time_have_no_section(tmp_path):

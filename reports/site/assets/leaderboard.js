@@ -39,6 +39,7 @@ function leaderboardTab(group) {
       + "method from above and below. A number opens the test views behind it."),
     Object.entries(group.absent).length > 0 && el("details", {}, el("summary", {}, "Absent numbers"),
       el("ul", {}, Object.entries(group.absent).map(([name, why]) => el("li", {}, el("code", {}, name), `: ${why}`)))),
+    unstable(group),
     unfinished(group),
     board.open && drill(group),
   ];
@@ -74,13 +75,14 @@ function boardTable(group, columns) {
   };
   const head = el("tr", {}, sorter("label", "method", false), el("th", { scope: "col" }, "scenes"),
     columns.map((i) => sorter(i.name, titled(i.name), DATA.metrics[i.metric].higher)),
-    sorter("fit", "fit s", false), sorter("total", "total s", false), sorter("peak", "peak MB", false));
+    sorter("fit", "fit s", false), sorter("cpu", "fit CPU s", false), sorter("total", "total s", false), sorter("peak", "peak MB", false));
   const body = sortedRows(group).map((row) => el("tr", { class: row.kind },
     el("th", { scope: "row", title: row.about ?? "" }, row.label,
       row.seeds.length > 1 && el("small", {}, ` ${row.seeds.length} seeds`)),
     el("td", { title: scenesOf(group, row).join(", ") }, String(scenesOf(group, row).length)),
     columns.map((i) => scoreCell(group, row, i)),
     el("td", {}, row.kind === "method" ? seconds(row.fit) : ""),
+    el("td", {}, row.kind === "method" ? seconds(row.cpu) : ""),
     el("td", {}, row.kind === "method" ? seconds(row.total) : ""),
     el("td", {}, row.kind === "method" ? row.peak.toFixed(0) : "")));
   return el("table", { class: "board" }, el("thead", {}, head), el("tbody", {}, body));
@@ -131,6 +133,12 @@ function drill(group) {
     el("p", { class: "note" }, el("code", {}, identity), "; worst test views first."), scenes);
 }
 
+function unstable(group) {
+  const rows = group.rows.filter((row) => row.kind === "method" && row.unstable.length > 0);
+  return rows.length > 0 && el("ul", { class: "note" }, rows.map((row) =>
+    el("li", {}, `Unstable seconds: ${row.label}: ${row.unstable.join("; ")}`)));
+}
+
 function unfinished(group) {
   const runs = group.runs.map((k) => DATA.runs[k]).filter((run) => run.status !== "done");
   return runs.length > 0 && el("ul", { class: "unfinished" }, runs.map((run) =>
@@ -139,7 +147,7 @@ function unfinished(group) {
 
 // The table as it stands, for a paper, a spreadsheet or a page.
 function asText(group, columns, form) {
-  const head = ["method", "scenes", ...columns.map((i) => titled(i.name)), "fit s", "total s"];
+  const head = ["method", "scenes", ...columns.map((i) => titled(i.name)), "fit s", "fit CPU s", "total s"];
   const lines = sortedRows(group).map((row) => [
     row.label, String(scenesOf(group, row).length),
     ...columns.map((i) => {
@@ -152,7 +160,7 @@ function asText(group, columns, form) {
       }
       return mark === "best" ? `**${text}**` : text;
     }),
-    row.kind === "method" ? seconds(row.fit) : "", row.kind === "method" ? seconds(row.total) : "",
+    ...[row.fit, row.cpu, row.total].map((spent) => (row.kind === "method" ? seconds(spent) : "")),
   ]);
   if (form === "CSV") {
     const quoted = (cell) => (/[",\n]/.test(cell) ? `"${cell.replaceAll('"', '""')}"` : cell);
