@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 from ihbench.document.document import Block, Paragraph, Span, Table
 
-LABEL = re.compile(r"(?P<method>.+?) \((?P<words>.+)\)(?P<rest>(?: on [A-Z]\d*| \[[^\]]*\])*)", re.DOTALL)
+LABEL = re.compile(r"(?P<method>.+?) \((?P<words>.+)\)(?P<rest>(?: on [A-Z]\d*| \[[^\]]*\]| †)*)", re.DOTALL)
 NEXT = re.compile(r", (?=[\w.]+=|only |code |predictions|\d+ views )")  # between the words in brackets of a label
 LONG = 40  # characters: in Markdown and on pages only longer names are cut
 

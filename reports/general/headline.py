@@ -7,12 +7,13 @@ from collections.abc import Sequence
 
 from rich.cells import cell_len, set_cell_size
 
-from ihbench.document.document import Block, Heading, Paragraph, Table
+from ihbench.document.document import Block, Heading, Paragraph, Table, bullets
 from ihbench.errors import visible
 from ihbench.metrics import Identity
 from ihbench.record.results import TRACEBACK, NotRun, RunResult, by_group
 from ihbench.record.row_labels import by_label
 from ihbench.reports.general.clock import mean_cost, waited
+from ihbench.reports.general.remarks import lacking
 from ihbench.reports.general.significance import further_rows, score_cells
 from ihbench.scoring.calibration import ROWS
 
@@ -21,6 +22,7 @@ NARROWEST = 40
 NAME = 18  # columns that a row's name gets at least
 GAP = 2
 COSTS = ("fit s", "render ms")
+LACKS = " †"  # at the name of a row over fewer scenes or seeds than others have
 SHOWN = 6  # pictures, and runs that are not done, that are named one by one
 
 
@@ -79,7 +81,7 @@ def headline_section(results: Sequence[RunResult]) -> list[Block]:
             f"{protocol}, {profile} profile, {data}; region {headline}, mean over test views of {', '.join(scenes)}."
         )
         note += f" {words}." if (words := waited(runs)) else ""
-        blocks += [Paragraph(note), Table(head, rows)]
+        blocks += [Paragraph(note), Table(head, rows), *bullets(_lacking(runs))]
     return [Heading(2, "Headline"), *blocks] if blocks else []
 
 
@@ -122,7 +124,10 @@ def _group(runs: Sequence[RunResult], width: int, not_run: Sequence[str]) -> lis
     reasons = dict.fromkeys(
         means[i].reason for i in in_headline if i not in present for means in own if i in means and means[i].reason
     )
-    why = [line for reason in reasons for line in _wrapped(reason, width)]
+    lacks = _lacking(done)
+    lacks[SHOWN:] = [f"{LACKS.strip()} {len(lacks) - SHOWN} more rows: --full"] if len(lacks) > SHOWN else []
+    why = [line for words in lacks for line in _wrapped(words, width)]
+    why += [line for reason in reasons for line in _wrapped(reason, width)]
     return [*title, "", lines[0], "-" * max(map(cell_len, lines)), *lines[1:], "", *_wrapped(note, width), *why]
 
 
@@ -130,13 +135,19 @@ def _rows(done: Sequence[RunResult], identities: Sequence[Identity]) -> list[tup
     """Name and cells of each row: the methods', with their further groups of test views, then the calibration's."""
     rows = []
     for label, group in by_label(done).items():
-        method = group[0].method
-        rows.append((label, [*score_cells(group, identities, method), *_costs(group)]))
+        method, mark = group[0].method, LACKS if lacking(group, done) else ""
+        rows.append((label + mark, [*score_cells(group, identities, method), *_costs(group)]))
         further = further_rows(group)
         for row in further:
-            rows.append((label + row.removeprefix(method), [*score_cells(group, identities, row), "", ""]))
+            rows.append((label + row.removeprefix(method) + mark, [*score_cells(group, identities, row), "", ""]))
     bounds = [row for row in ROWS if any(row in run.rows for run in done)]
     return [*rows, *((row, [*score_cells(done, identities, row), "", ""]) for row in bounds)]
+
+
+def _lacking(done: Sequence[RunResult]) -> list[str]:
+    """What the mark at a row's name says."""
+    found = {label: lacking(group, done) for label, group in by_label(done).items()}
+    return [f"{LACKS.strip()} {label}: {lacks}" for label, lacks in found.items() if lacks]
 
 
 def _costs(runs: Sequence[RunResult]) -> list[str]:
@@ -148,8 +159,9 @@ def _costs(runs: Sequence[RunResult]) -> list[str]:
 
 
 def _cut(name: str, room: int) -> str:
-    """A name in exactly so many columns."""
-    return set_cell_size(name, room) if cell_len(name) <= room else set_cell_size(name, room - 1) + "…"
+    """A name in exactly so many columns; of one that is cut its mark stays."""
+    end = "…" + (LACKS if name.endswith(LACKS) else "")
+    return set_cell_size(name, room) if cell_len(name) <= room else set_cell_size(name, room - cell_len(end)) + end
 
 
 def _wrapped(text: str, width: int) -> list[str]:

@@ -30,6 +30,8 @@ def remarks(runs: Sequence[RunResult]) -> list[str]:
         notes += [f"{run.method} on {run.scene}: {note}" for note in remarks]
         notes += [f"{run.method} on {run.scene}: not shown: {damage}" for damage in run.damage]
     for label, group in by_label(runs).items():
+        if lacks := lacking(group, runs):
+            notes.append(f"{label}: {lacks}")
         for kind in (PLAN, FIT, BACK, WARNING):
             for text, having in _runs_by_text(group, kind).items():
                 notes.append(f"{kind}, {label} on {_scenes(having)}{_share(having, group)}: {text}")
@@ -38,6 +40,19 @@ def remarks(runs: Sequence[RunResult]) -> list[str]:
     for (metric, reason), regions in absent.items():
         notes.append(f"absent: {metric}, {', '.join(dict.fromkeys(regions))}: {reason}")
     return sorted(set(notes))
+
+
+def lacking(row: Sequence[RunResult], block: Sequence[RunResult]) -> str:
+    """Which scenes and seeds a row's mean does not run over that other rows of its block have: "over 4 of 6 scenes,
+    without e, f"; "" where it has all of them. Both hold finished runs."""
+    scenes, having = {run.scene for run in block}, {run.scene for run in row}
+    seeds = {(run.scene, run.seed) for run in block if run.scene in having} - {(run.scene, run.seed) for run in row}
+    parts = []
+    if missing := scenes - having:
+        parts.append(f"over {len(having)} of {len(scenes)} scenes, without {', '.join(sorted(missing))}")
+    for seed, of in sorted(grouped((seed, scene) for scene, seed in seeds).items()):
+        parts.append(f"without seed {seed} on {', '.join(sorted(of))}")
+    return "; ".join(parts)
 
 
 def row_footnotes(runs: Sequence[RunResult], kinds: Sequence[str] = (PLAN, FIT, BACK)) -> list[str]:

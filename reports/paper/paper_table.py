@@ -35,7 +35,7 @@ from ihbench.record.results import RunResult, group_row, grouped
 from ihbench.record.row_choice import EVERYTHING, Choice
 from ihbench.record.row_labels import by_label
 from ihbench.record.scene_means import scene_means
-from ihbench.reports.general.remarks import row_footnotes
+from ihbench.reports.general.remarks import lacking, row_footnotes
 from ihbench.reports.general.significance import LEVEL
 from ihbench.reports.paper.comparison import as_the_profile_has_it, beaten_notes, rank_note
 from ihbench.reports.paper.paper_numbers import Column, Component, Group, PaperRow, PaperTable
@@ -304,7 +304,9 @@ def _measured_block(
         notes += _about(group, runs, done, shown_region, identities)
         for column, identity in zip(group.columns, identities, strict=True):
             ranked = [
-                _cell(column, [run for run in having if id(run) in here], group.views, identity, kind, footnotes)
+                _cell(
+                    column, [run for run in having if id(run) in here], done, group.views, identity, kind, footnotes
+                )
                 for having in labelled.values()
             ]
             marks = marks_by_interval(
@@ -392,7 +394,13 @@ def _identity(done: Sequence[RunResult], group: Group, metric: str, region: str)
 
 
 def _cell(
-    column: Column, runs: Sequence[RunResult], views: str, identity: Identity | None, kind: Kind, footnotes: Footnotes
+    column: Column,
+    runs: Sequence[RunResult],
+    block: Sequence[RunResult],  # the finished ones of all rows
+    views: str,
+    identity: Identity | None,
+    kind: Kind,
+    footnotes: Footnotes,
 ) -> tuple[Number, dict[str, float]]:
     """A method's cell, and its finite means by scene."""
     done = [run for run in runs if run.status == "done"]
@@ -407,6 +415,7 @@ def _cell(
     cell = _filled(column, means, identity, kind, footnotes)
     remarks = [_outcome(run) for run in runs if run.status != "done"]
     scored = [(run.scene, run.rows.get(group_row(run.method, views), {}).get(identity)) for run in done]
+    remarks += [lacks] if (lacks := lacking(done, block)) else []
     remarks += [f"{scene}: {mean.note}" for scene, mean in scored if mean is not None and mean.note]
     cell = replace(cell, footnotes=(*cell.footnotes, *footnotes.of(dict.fromkeys(remarks))))
     return cell, {scene: mean.value for scene, mean in means.items() if math.isfinite(mean.value)}

@@ -20,13 +20,14 @@ def test_methods_come_first_then_what_bounds_them():
     lines = lines_of(fake_run("a", psnr=20.0), fake_run("b", psnr=21.0), fake_run("a", "other", psnr=19.0))
     assert lines[0] == "zju_occ@1, quick profile, stand-in v1 seed 0: made by the bench, not real data"
     head, rule, ours, other, truth = (line.split() for line in lines[2:7])
+    assert other.pop(1) == "†"
     assert head == ["region", "body", "PSNR", "↑", "SSIM", "↑", "fit", "s"]
     assert set("".join(rule)) == {"-"}
     assert ours == ["ours", "20.50", "0.9000", "10"]
     assert other == ["other", "19.00", "0.9000", "10"]
     assert truth == ["truth", "∞", "1.0000"]
     about = lines.index("mean over test views of a, b; not shown: LPIPS*")
-    assert lines[about + 1] == "weights are not there"
+    assert lines[about + 1 : about + 3] == ["† other: over 1 of 2 scenes, without b", "weights are not there"]
     assert lines[-1].endswith("--full")
 
 
@@ -36,7 +37,7 @@ def test_what_drawing_takes_is_shown_where_there_is_room():
     lines = lines_of(*runs)
     assert lines[2].split()[-4:] == ["fit", "s", "render", "ms"]
     assert lines[4].split() == ["ours", "20.00", "0.9000", "10", "62.8"]
-    assert lines[5].split() == ["other", "19.00", "0.9000", "10"]
+    assert lines[5].split() == ["other", "†", "19.00", "0.9000", "10"]
     (head,) = (line for line in lines_of(*runs, width=46) if line.startswith("region"))
     assert head.split()[-2:] == ["fit", "s"]
     assert "SSIM" in head  # it goes before a metric does
@@ -52,6 +53,22 @@ def test_a_page_begins_with_the_same_tables():
     page = HTML(runs)
     assert page.index(">Headline<") < page.index(">zju_occ@1, quick profile<")
     assert headline_section(runs[2:]) == []
+
+
+def test_a_row_over_fewer_scenes_or_seeds_is_marked_however_long_its_name_is():
+    named = {"changed": {f"s{k}": k for k in range(40)}}
+    runs = [fake_run(scene, who={"seed": seed}) for scene in "ab" for seed in (0, 1)]
+    runs += [fake_run("a", "long", said=named), fake_run("a", "long", said=named, who={"seed": 1})]
+    runs += [fake_run("a", "once"), fake_run("b", "once")]
+    for width in (40, 80):
+        lines = lines_of(*runs, width=width)
+        names = [line.split(" 20.00")[0].strip() for line in lines if " 20.00" in line]
+        assert [name.split()[0] for name in names if name.endswith("†")] == ["long", "once"]
+        assert len(names) == 3
+        assert "over 1 of 2 scenes, without b † once: without seed 1 on a, b" in " ".join(lines)
+    *_, said = headline_section(runs)
+    assert said.items[1] == "† once: without seed 1 on a, b"
+    assert "once †" in HTML(runs)
 
 
 @pytest.mark.parametrize("width", [10, 40, 61, 80, 200])

@@ -204,6 +204,14 @@ def test_views_that_a_mean_does_not_run_over_are_counted():
     assert "- body of a (PSNR): 2 of 4 without any error (inf) left out" in text
 
 
+def test_a_row_says_which_scenes_and_seeds_it_lacks():
+    runs = [run(scene, seed=seed) for scene in "abc" for seed in (0, 1)]
+    runs += [run("a", "few"), run("c", "few", seed=1), run("a", "few", seed=1)]
+    text = write(runs)
+    assert "- few: over 2 of 3 scenes, without b; without seed 0 on c\n" in text
+    assert "- ours: " not in text
+
+
 def test_what_was_left_out_is_said_once():
     left_out = (Omission("levels", [16], "too fine"),)
     text = write([run("a", left_out=left_out), run("b", left_out=left_out)])

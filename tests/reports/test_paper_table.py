@@ -106,6 +106,15 @@ def test_stand_ins_and_real_data_never_share_a_block():
     assert [table.kind for table in frame.tables] == ["quoted", "quoted elsewhere", "real data", "stand-in"]
 
 
+def test_a_cell_over_fewer_scenes_than_others_says_so():
+    runs = [*on_all("whole", 20.0), fake_run("a", "few", 30.0), fake_run("b", "few", 31.0)]
+    frame = build_frame(TABLE1, runs)
+    table = block(frame, "stand-in")
+    (letter,) = cell(table, "few", "ZJU-MoCap", "psnr").footnotes
+    assert frame.footnotes[letter] == "over 2 of 4 scenes, without c, d"
+    assert cell(table, "whole", "ZJU-MoCap", "psnr").footnotes == ()
+
+
 def test_a_row_says_what_the_plan_and_the_fits_left_out_of_it():
     left_out = (Omission("levels", [16], "too fine"),)
     runs = [fake_run("a", said={"left_out": left_out}), fake_run("b"), *on_all("theirs", 20.0)]
