@@ -5,9 +5,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from datetime import datetime
 
 from ihbench.metrics.statistics import mean_interval
-from ihbench.record.results import RunResult
+from ihbench.record.results import RunResult, grouped
 from ihbench.reports.general.significance import LEVEL
 from ihbench.reports.paper.paper_numbers import Column, PaperTable
 from ihbench.reports.paper.rank_agreement import better_than, rank_agreement
@@ -15,9 +16,34 @@ from ihbench.reports.paper.rank_agreement import better_than, rank_agreement
 Scores = Mapping[str, Mapping[str, float]]  # method -> person (scene) -> mean over seeds, finite
 
 
-def as_the_profile_has_it(labelled: Mapping[str, Sequence[RunResult]]) -> dict[str, str]:
-    """Label -> method of the rows that are a system and no variant of it: no switch differs from the profile."""
-    return {label: runs[0].method for label, runs in labelled.items() if label == runs[0].method}
+def as_the_profile_has_it(labelled: Mapping[str, Sequence[RunResult]]) -> tuple[dict[str, str], list[str]]:
+    """Label -> method of one row for each system, none of whose switches differ from the profile; and what is told of
+    rows that are set aside. Of several, as of several versions of the code, the one with the most scenes counts, else
+    the newest."""
+    made = {label: runs for label, runs in labelled.items() if all(run.about.predictions is None for run in runs)}
+    plain = [label for label, runs in made.items() if not any(run.about.changed for run in runs)]
+    by_method = grouped((labelled[label][0].method, label) for label in plain)
+    chosen = {method: max(rows, key=lambda row: _weight(labelled[row])) for method, rows in by_method.items()}
+    notes = [
+        f"{other}: not in the rank agreement and the comparisons: {chosen[method]} has "
+        f"{'more scenes' if _weight(labelled[chosen[method]])[0] > _weight(labelled[other])[0] else 'newer runs'}."
+        for method, rows in by_method.items()
+        for other in rows
+        if other != chosen[method]
+    ]
+    variants = grouped((runs[0].method, label) for label, runs in made.items() if label not in plain)
+    notes += [
+        f"{method}: not in the rank agreement and the comparisons: all its rows have other switches than the profile."
+        for method in variants
+        if method not in chosen
+    ]
+    return {label: method for method, label in chosen.items()}, notes
+
+
+def _weight(runs: Sequence[RunResult]) -> tuple[int, datetime]:
+    """How many scenes are done, and when the newest run was begun."""
+    scenes = {run.scene for run in runs if run.status == "done"}
+    return len(scenes), max(datetime.fromisoformat(run.record.outcome.created) for run in runs)
 
 
 def rank_note(table: PaperTable, column: Column, scores: Scores) -> list[str]:
@@ -40,8 +66,10 @@ def beaten_notes(table: PaperTable, group: str, scores: Mapping[tuple[str, Colum
     own = next((row for row in table.rows if row.own), None)
     methods = list(dict.fromkeys(m for by_method in scores.values() for m, having in by_method.items() if having))
     ours = next((m for m in methods if own is not None and own.is_of(m)), None)
-    if ours is None or len(methods) < 2:
+    if own is None or len(methods) < 2:
         return []
+    if ours is None:
+        return [f"{group}: {own.name} was not measured here as its profile has it: no system is compared with it."]
     notes: list[str] = []
     for region in dict.fromkeys(region for region, _ in scores):
         parts = [

@@ -295,7 +295,8 @@ def _measured_block(
     notes += [f"Not done: {run.method} on {_outcome(run)}." for run in unlabelled]
     columns: list[list[Number]] = []  # by column, then by row
     calibrations = choice.bounds([name for name in ROWS if any(name in run.rows for run in everything)])
-    systems = as_the_profile_has_it(labelled)
+    systems, set_aside = as_the_profile_has_it(labelled)
+    notes += set_aside
     for group, runs in filled:
         done = [run for run in runs if run.status == "done"]
         here = {id(run) for run in runs}

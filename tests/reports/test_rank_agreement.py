@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -147,6 +148,33 @@ def test_variants_and_systems_that_the_paper_has_not_do_not_count():
     assert "gauhuman" not in better
 
 
+def test_one_run_of_another_version_of_the_code_does_not_take_a_system_out():
+    runs = runs_of({"inpainthuman": 30.0, "occnerf": 20.0, "gauhuman": 21.0})
+    runs += [
+        fake_run("a", "inpainthuman", 50.0, who={"code": "2+0"}),
+        fake_run("a", "gtu", said={"changed": {"x": 1}}),
+    ]
+    table, notes = notes_of(build_frame(TABLE1, runs))
+    assert any("over 3 systems (gauhuman, occnerf, inpainthuman)" in note for note in notes)
+    assert "ZJU-MoCap: no other system measured here is better than inpainthuman in any region." in notes
+    where = "not in the rank agreement and the comparisons"
+    assert [note for note in table.notes if where in note] == [
+        f"inpainthuman (code 2+0): {where}: inpainthuman (code 1+0) has more scenes.",
+        f"gtu: {where}: all its rows have other switches than the profile.",
+    ]
+
+
+def test_of_two_versions_of_the_code_with_as_many_scenes_the_newest_counts():
+    runs = runs_of({"inpainthuman": 30.0, "occnerf": 20.0, "gauhuman": 21.0})
+    for run in runs_of({"gauhuman": 19.0}):
+        outcome = replace(run.record.outcome, created="2026-01-01T00:00:00+00:00")
+        who = replace(run.identity, code="2+0")
+        runs.append(replace(run, record=replace(run.record, outcome=outcome, identity=who)))
+    table, notes = notes_of(build_frame(TABLE1, runs))
+    assert any("gauhuman (code 1+0)" in note and note.endswith("(code 2+0) has newer runs.") for note in table.notes)
+    assert any(note.startswith("Rank agreement") and "rho +1.00" not in note for note in notes)
+
+
 def test_where_a_system_is_better_than_the_papers_own_the_table_says_so():
     hidden = {"hidden": {"inpainthuman": 15.0, "gauhuman": 5.0, "occnerf": 16.0}}
     runs = runs_of({"inpainthuman": 30.0, "occnerf": 20.0, "gauhuman": 21.0}, hidden=hidden)
@@ -161,8 +189,10 @@ def test_and_where_none_is_it_says_that():
     _, notes = notes_of(build_frame(TABLE1, runs))
     assert "ZJU-MoCap: no other system measured here is better than inpainthuman in any region." in notes
     for psnr in ({"inpainthuman": 30.0}, {"occnerf": 20.0, "gauhuman": 21.0}):
-        _, notes = notes_of(build_frame(TABLE1, runs_of(psnr)))
+        table, notes = notes_of(build_frame(TABLE1, runs_of(psnr)))
         assert not any("better than" in note for note in notes)
+        alone = "ZJU-MoCap: InpaintHuman was not measured here as its profile has it: no system is compared with it."
+        assert (alone in table.notes) == ("occnerf" in psnr)
 
 
 def test_a_lead_that_people_do_not_confirm_is_told_as_such():
