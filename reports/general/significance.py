@@ -86,6 +86,8 @@ def _comparisons(values: Mapping[str, Mapping[str, float]], metric: Metric) -> l
     if not tests:
         return []
     adjusted = dict(zip(tests, holm([test.p for test, _ in tests.values()]), strict=True))
+    # what is left of it where every test gives the smallest p that its number of scenes allows
+    least = dict(zip(tests, holm([test.smallest_p for test, _ in tests.values()]), strict=True))
     unit = f" {metric.unit}" if metric.unit == "dB" else ""
     lines = []
     for label, (test, differences) in tests.items():
@@ -94,10 +96,9 @@ def _comparisons(values: Mapping[str, Mapping[str, float]], metric: Metric) -> l
         if math.isfinite(test.interval.low):
             low, high = (value * metric.scale for value in (test.interval.low, test.interval.high))
             spread = f" [{low:+.{metric.decimals}f}, {high:+.{metric.decimals}f}]"
-        least = test.smallest_p * len(tests)  # Holm multiplies the smallest by the number of tests
-        if least >= ALPHA:
+        if least[label] >= ALPHA:
             n = len(differences)
-            verdict = f"cannot be significant: {n} scenes allow no adjusted p below {min(least, 1):.2g}"
+            verdict = f"cannot be significant: {n} scenes allow no adjusted p below {least[label]:.2g}"
         else:
             verdict = (
                 f"{'significant' if adjusted[label] < ALPHA else 'not significant'}; a true difference of "

@@ -269,6 +269,14 @@ def test_too_few_scenes_cannot_be_significant_and_one_has_no_interval():
     assert "interval" not in write([run()])
 
 
+def test_fewer_scenes_of_one_comparison_can_be_significant_beside_more_of_another():
+    """Holm multiplies only the smallest p by the number of tests: ten scenes leave six theirs."""
+    scores = {"a": (10, 30.0, 0.1), "b": (10, 25.0, 0.13), "c": (6, 24.0, 0.07)}
+    runs = [run(f"s{k}", name, psnr=v + d * k) for name, (n, v, d) in scores.items() for k in range(n)]
+    line = next(line for line in write(runs).splitlines() if line.startswith("- PSNR: a against c"))
+    assert "p = 0.031 (sign-flip test over 6 scenes, Holm over 2), significant" in line
+
+
 def test_a_preset_scored_later_has_a_table_of_its_own():
     legacy = "psnr/gauhuman-channels/range1/full/v1"
     result = run()
