@@ -10,6 +10,7 @@ import pandas
 
 from ihbench.document.document import Paragraph, Table, Words, emphasis, strong, write_fragment
 from ihbench.document.html import escape
+from ihbench.document.metric_names import heads
 
 SHEET_WIDTH = 900  # px at most of a contact sheet, which would make a notebook megabytes large
 LINES = 6  # of a long table
@@ -26,7 +27,7 @@ def run_html(run: Any) -> str:
     if run.status != "done":
         return f"{text}<p>{escape(run.outcome)}</p>"
     shown = [i for i in run.own if i.region == run.headline]
-    head: list[Words] = [f"region {run.headline}", *(i.display.head() for i in shown), "fit s", "render ms"]
+    head: list[Words] = [f"region {run.headline}", *heads(shown).values(), "fit s", "render ms"]
     rows = []
     for name, means in run.rows.items():
         cells = [i.display.text(means[i].value) if i in means else "—" for i in shown]

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ihbench.document.document import Block, Heading, Paragraph, Table, Words, bullets
+from ihbench.document.metric_names import heads
 from ihbench.metrics import Identity
 from ihbench.metrics.identity import Metric
 from ihbench.metrics.statistics import Interval, holm, mean_interval, paired_test
@@ -63,7 +64,7 @@ def _table(suite: AblationSuite, protocol: str, cells: Found) -> tuple[list[Bloc
     headline = done[0].headline
     columns = _columns(done, headline)
     quoted = [m for m in PAPER if any(m in variant.paper for variant in suite.variants)]
-    titles = [i.display.head(i.region) for i in columns]
+    titles = [*heads(columns, region=True).values()]
     titles += ["fit s"] + [f"paper's {PAPER[m][0]}" for m in quoted]
     blocks.append(Paragraph(("Data: ", *data_words(done[0]), ".")))
     lines: list[tuple[Words, ...]] = []
@@ -143,7 +144,7 @@ def _comparisons(
     rows = [row for row in rows if any(row["scores"].values())]
     if not rows:
         return [], []
-    titles = [i.display.head(i.region) for i in columns]
+    titles = [*heads(columns, region=True).values()]
     lines: list[tuple[Words, ...]] = []
     for row in rows:
         n = max(pair["n"] for pair in row["scores"].values() if pair)

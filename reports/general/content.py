@@ -21,6 +21,7 @@ from ihbench.document.document import (
     emphasis,
     strong,
 )
+from ihbench.document.metric_names import variants_told
 from ihbench.errors import BadInput
 from ihbench.metrics import Identity
 from ihbench.record.quality_time import Target
@@ -178,11 +179,13 @@ def _table(
     with_costs: bool = False,
     with_metric: bool = False,
 ) -> Table:
-    names = [f"{i.display.title}{i.display.arrow} {i.region}" if with_metric else i.region for i in columns]
-    names = [  # regions of several presets in one table
-        f"{name} ({i.variant})" if names.count(name) > 1 else name for i, name in zip(columns, names, strict=True)
-    ]
-    titles: list[Words] = [strong(t) if i.region == headline else t for i, t in zip(columns, names, strict=True)]
+    names = {
+        i: f"{i.display.title}{i.display.arrow} {i.region} {said}".rstrip()
+        if with_metric
+        else f"{i.region} {said}".rstrip()
+        for i, said in variants_told(columns).items()
+    }
+    titles: list[Words] = [strong(names[i]) if i.region == headline else names[i] for i in columns]
     of_cpu = any(fit_cpu_seconds(run) is not None for run in runs)
     costs = ["fit s", *(["fit CPU s"] if of_cpu else []), "total s", "peak MB", "render ms"] if with_costs else []
     head: list[Words] = ["method", "scenes", "seeds", *titles, *costs]

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ihbench.document import diagram
+from ihbench.document.metric_names import variants_told
 from ihbench.metrics import Identity
 from ihbench.metrics.identity import METRICS
 from ihbench.metrics.statistics import Interval, interval_ends
@@ -147,6 +148,7 @@ def _diagram(
     rows: list[dict[str, object]] = []
     handles: dict[str, Artist] = {}
     labels: list[tuple[Axes, list[diagram.Label], list[list[tuple[float, float]]]]] = []
+    told = variants_told(panels)
     for panel, (identity, points) in zip(axes, panels.items(), strict=False):
         front = pareto(points)
         diagram.logarithmic(panel, _shown([p.seconds for p in points]), _shown([p.error for p in points]))
@@ -159,7 +161,12 @@ def _diagram(
                 *zip(*steps, strict=True), drawstyle="steps-post", color="#777777", ls="--", lw=1.1, zorder=1
             )
             handles.setdefault("Pareto set: nothing is as fast and better", line)
-        _name_axes(panel, identity, f"seconds of fitting, mean of {len(scenes)} scene{'s' * (len(scenes) > 1)}")
+        _name_axes(
+            panel,
+            identity,
+            f"seconds of fitting, mean of {len(scenes)} scene{'s' * (len(scenes) > 1)}",
+            told[identity],
+        )
         rows += [_csv_row(p, identity, k in front, len(scenes)) for k, p in enumerate(points)]
     _finish(drawn, handles, title, about)
     for panel, beside, lines in labels:
@@ -254,7 +261,9 @@ def _ends(name: str, interval: Interval) -> dict[str, float]:
 def _quality_time(
     configs: Sequence[Configuration], headline: str, path: Path, title: str, about: str
 ) -> list[tuple[Path, str]]:
-    panels = {(i.metric, i.region): i for i in curve_identities(configs)}
+    known = curve_identities(configs)
+    told = variants_told(known)
+    panels = {(i.metric, i.region): i for i in reversed(known)}  # of several definitions the first
     metrics = [m for m in ON_THE_CURVE if any((m, r) in panels for r in (headline, *PARTITION))]
     regions = [r for r in dict.fromkeys((headline, *PARTITION)) if any((m, r) in panels for m in metrics)]
     if not metrics:
@@ -273,7 +282,7 @@ def _quality_time(
         rows += shown
         times, errors = [row["seconds"] for row in shown], [row["error"] for row in shown]
         diagram.logarithmic(panel, times, errors)
-        _name_axes(panel, identity, "seconds of fitting", f"\non {views} test views")
+        _name_axes(panel, identity, "seconds of fitting", told[identity], f"\non {views} test views")
     if not handles:
         return []
     _finish(drawn, handles, f"Quality against time: {title}", about)
@@ -349,12 +358,13 @@ def _waited(configs: Sequence[Configuration]) -> str:
     return f" {words}: drawn by the wall clock." if words else ""
 
 
-def _name_axes(panel: Axes, identity: Identity, below: str, where: str = "") -> None:
-    """Name the axes; `where` says on which views. A PSNR's error gets its decibels on the right."""
+def _name_axes(panel: Axes, identity: Identity, below: str, variant: str, where: str = "") -> None:
+    """Name the axes; `variant` tells the metric from others of its name, `where` says on which views. A PSNR's
+    error gets its decibels on the right."""
     metric = identity.metric
     panel.set_xlabel(below)
     panel.set_ylabel(f"{AXES.get(metric, metric)}  (less is better){where}")
-    panel.set_title(identity.region)
+    panel.set_title(f"{identity.region} {variant}".rstrip())
     if metric == "psnr":
         beside = panel.twinx()
         low, high = panel.get_ylim()

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from rich.cells import cell_len, set_cell_size
 
 from ihbench.document.document import Block, Heading, Paragraph, Table, bullets
+from ihbench.document.metric_names import heads, named
 from ihbench.errors import visible
 from ihbench.metrics import Identity
 from ihbench.record.results import TRACEBACK, NotRun, RunResult, by_group
@@ -74,7 +75,7 @@ def headline_section(results: Sequence[RunResult]) -> list[Block]:
         own = [run.own for run in runs]
         identities = [i for i in dict.fromkeys(i for means in own for i in means) if i.region == headline]
         present = [i for i in identities if any(i in means and not means[i].absent for means in own)]
-        head = ("method", *(i.display.head() for i in present), COSTS[0])
+        head = ("method", *heads(present).values(), COSTS[0])
         rows = tuple((name, *cells[:-1]) for name, cells in _rows(runs, present))  # the others are below it
         scenes = sorted({run.scene for run in runs})
         note = (
@@ -101,10 +102,10 @@ def _group(runs: Sequence[RunResult], width: int, not_run: Sequence[str]) -> lis
     without = [method for method in without if not any(run.method == method for run in done)]
     bounds = next((k for k, (name, _) in enumerate(rows) if name in ROWS), len(rows))
     rows[bounds:bounds] = [(method, ["—"] * len(present) + ["—", ""]) for method in without]
-    heads = [i.display.head() for i in present] + list(COSTS)
-    table = [(visible(name), cells) for name, cells in [(f"region {headline}", heads), *rows]]
-    sizes = [max(cell_len(cells[k]) for _, cells in table) for k in range(len(heads))]
-    kept = list(range(len(heads)))
+    titles = [*heads(present).values(), *COSTS]
+    table = [(visible(name), cells) for name, cells in [(f"region {headline}", titles), *rows]]
+    sizes = [max(cell_len(cells[k]) for _, cells in table) for k in range(len(titles))]
+    kept = list(range(len(titles)))
     if not any(cells[-1] for _, cells in rows) or NAME + sum(sizes[k] + GAP for k in kept) > width:
         kept.pop()  # first what drawing takes
     while len(kept) > 1 and NAME + sum(sizes[k] + GAP for k in kept) > width:
@@ -115,8 +116,8 @@ def _group(runs: Sequence[RunResult], width: int, not_run: Sequence[str]) -> lis
         (_cut(name, room) + "".join(" " * (GAP + sizes[k] - cell_len(cells[k])) + cells[k] for k in kept)).rstrip()
         for name, cells in table
     ]
-    absent = [i.display.title for i in in_headline if i not in present]
-    absent += [heads[k] for k in range(len(present)) if k not in kept]
+    absent = [name for i, name in named(in_headline).items() if i not in present]
+    absent += [titles[k] for k in range(len(present)) if k not in kept]
     scenes = sorted({run.scene for run in done})
     note = f"mean over test views of {', '.join(scenes) if len(scenes) <= SHOWN else f'{len(scenes)} scenes'}"
     note += f"; not shown: {', '.join(absent)}" if absent else ""

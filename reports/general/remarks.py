@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from ihbench.clock.events import LeftOut, RolledBack, Warned
+from ihbench.document.metric_names import named
 from ihbench.record.results import RunResult, grouped
 from ihbench.record.row_labels import by_label
 from ihbench.record.shareable import without_places
@@ -18,9 +19,10 @@ def remarks(runs: Sequence[RunResult]) -> list[str]:
     absent: dict[tuple[str, str], list[str]] = {}
     partly: dict[tuple[str, str, str], list[str]] = {}
     notes: list[str] = []
+    names = named(i for run in runs for i in run.own)
     for run in runs:
         for identity, mean in run.own.items():
-            metric, region = identity.display.title, identity.region
+            metric, region = names[identity], identity.region
             if mean.absent:
                 absent.setdefault((metric, mean.reason), []).append(region)
             elif mean.note:

@@ -12,6 +12,7 @@ from statistics import median
 import numpy as np
 
 from ihbench.document.document import Block, Heading, Paragraph, Table, Words, bullets
+from ihbench.document.metric_names import heads, named, variants_told
 from ihbench.metrics import Identity
 from ihbench.metrics.statistics import Interval, mean_interval, median_interval
 from ihbench.record.quality_time import (
@@ -166,7 +167,8 @@ def _cost_table(configs: Sequence[Configuration], identities: Sequence[Identity]
         i: {p.configuration.label: p for p in work_points(configs, i)} for i in identities if i.region == headline
     }
     points = {i: row for i, row in points.items() if row}
-    best = grouped(([*row][k], i.display.title) for i, row in points.items() for k in pareto(row.values()))
+    names = named(points)
+    best = grouped(([*row][k], names[i]) for i, row in points.items() for k in pareto(row.values()))
     every = [run for c in configs for run in c.runs]
     on_gpu = any(_device_mb(run) > 0 for run in every)
     of_cpu = any(fit_cpu_seconds(run) is not None for run in every)
@@ -190,7 +192,7 @@ def _cost_table(configs: Sequence[Configuration], identities: Sequence[Identity]
     kinds = sorted({interval.method for interval in seconds.values() if math.isfinite(interval.low)})
     head = ["method", "runs", f"fit s [{SPREAD}]" if kinds else "fit s", *(["fit CPU s"] if of_cpu else [])]
     head += ["total s", "peak MB"]
-    head += [*(["GPU MB"] if on_gpu else []), "render ms", *(i.display.head() for i in points), "Pareto"]
+    head += [*(["GPU MB"] if on_gpu else []), "render ms", *heads(points).values(), "Pareto"]
     note = (
         f"Region {headline}, {len(scenes)} scene{'s' if len(scenes) > 1 else ''} that all these rows have. The fit "
         "clock stands still while checkpoints are scored and states are saved; total s is the whole run; render ms "
@@ -235,7 +237,7 @@ def _time_table(
         targets = [Target(m, v) for m in ON_THE_CURVE if m in first for v in _round_ones(configs, first[m])]
     columns: list[tuple[float, Identity]] = []
     missing: list[Words] = []
-    head = ["method"]
+    head, told = ["method"], variants_told(known)
     for target in targets:
         region = target.region or headline
         i = next((i for i in known if (i.metric, i.region) == (target.metric, region)), None)
@@ -244,7 +246,7 @@ def _time_table(
             continue
         columns.append((target.value, i))
         metric, sign = i.display, "≥" if i.display.higher_is_better else "≤"
-        where = "" if region == headline else f" {region}"
+        where = f"{'' if region == headline else f' {region}'} {told[i]}".rstrip()
         unit = " dB" if metric.unit == "dB" else ""
         head.append(f"{metric.title}{where} {sign} {target.value * metric.scale:g}{unit}")
     if not columns or not configs:
@@ -306,7 +308,7 @@ def _end_table(configs: Sequence[Configuration], views: str, columns: Sequence[I
         f"The last point of the curves, on {views} test views, and the same avatars over all test views, as in the "
         "table: mean over scenes of the mean over seeds. By so much the curves, the times and the areas are off."
     )
-    head = ("method", *(i.display.head(i.region) for i in columns))
+    head = ("method", *heads(columns, region=True).values())
     title = "Where the curves end, and what the table has"
     return [Heading(3, title), Table(head, tuple(rows)), Paragraph(note)]
 
@@ -324,12 +326,13 @@ def _end_cell(configuration: Configuration, identity: Identity) -> str:
 
 def _area_table(configs: Sequence[Configuration], views: str, known: Sequence[Identity]) -> list[Block]:
     head, windows, cells = ["method"], set(), {c.label: [c.label] for c in configs}
-    for i in (i for metric in ON_THE_CURVE for i in known if i.metric == metric):
+    titles = heads((i for metric in ON_THE_CURVE for i in known if i.metric == metric), region=True)
+    for i in titles:
         found = {c.label: curves(c, i) for c in configs}
         start, end = common_window([curve for of_row in found.values() for curve in of_row.values()])
         if not math.isfinite(start):
             continue
-        head.append(i.display.head(i.region))
+        head.append(titles[i])
         windows.add(f"{_seconds(start)} to {_seconds(end)}")
         for label, of_row in found.items():
             areas = [(scene, area_under_curve(curve, start, end)) for (scene, _), curve in of_row.items()]

@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 
 from ihbench.document.document import Block, Heading, Paragraph, Table, Words, bullets
+from ihbench.document.metric_names import heads, named
 from ihbench.metrics import Identity, macro_mean
 from ihbench.metrics.identity import Metric
 from ihbench.metrics.statistics import Interval, holm, mean_interval, paired_test, smallest_detectable_difference
@@ -44,12 +45,13 @@ def intervals_section(
             methods.add(interval.method)
             cells.append(interval_text(interval, i.display.text))
         rows.append((label, *cells))
-    head = ("method", *(i.display.head() for i in columns))
+    names = named(columns)
+    head = ("method", *heads(columns).values())
     return [
         Heading(3, f"{headline}: mean over scenes and {LEVEL:.0%} interval"),
         Table(head, tuple(rows)),
         Paragraph(f"Intervals: {'; '.join(sorted(methods))}."),
-        *bullets([line for i in columns for line in _comparisons(values[i], i.display)]),
+        *bullets([line for i in columns for line in _comparisons(values[i], i.display, names[i])]),
     ]
 
 
@@ -70,7 +72,7 @@ def further_rows(runs: Sequence[RunResult]) -> list[str]:
     return list(dict.fromkeys(row for run in runs for row in run.rows if row.startswith(f"{run.method} [")))
 
 
-def _comparisons(values: Mapping[str, Mapping[str, float]], metric: Metric) -> list[str]:
+def _comparisons(values: Mapping[str, Mapping[str, float]], metric: Metric, name: str) -> list[str]:
     """The best row against every other over the scenes that both have, p values adjusted for their number."""
     having = {label: pair for label, pair in values.items() if len(pair) >= 2}
     if len(having) < 2:
@@ -105,7 +107,7 @@ def _comparisons(values: Mapping[str, Mapping[str, float]], metric: Metric) -> l
                 f"{smallest:.{metric.decimals}f}{unit} would be found {POWER:.0%} of the time (t test)"
             )
         lines.append(
-            f"{metric.title}: {best} against {label}: "
+            f"{name}: {best} against {label}: "
             f"{test.interval.value * metric.scale:+.{metric.decimals}f}{spread}{unit}, "
             f"p = {adjusted[label]:.2g} (sign-flip test over {len(differences)} scenes, Holm over {len(tests)}), "
             f"{verdict}"

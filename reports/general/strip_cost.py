@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 from ihbench.document.document import Block, Heading, Paragraph, Table, Words
+from ihbench.document.metric_names import heads
 from ihbench.metrics import Identity
 from ihbench.metrics.statistics import mean_interval
 from ihbench.record.results import RunResult, grouped
@@ -42,12 +43,12 @@ def _table(
     people: dict[str, set[str]] = {}
     head: list[Words] = ["method", "people"]
     methods: set[str] = set()
+    titles = heads(identities)
     for identity in identities:
         cells = {label: _cells(without[label], having[label], identity) for label in common}
         if not any(cells.values()):
             continue
-        metric = identity.display
-        head += [f"{metric.head()} without", "with", f"cost [{LEVEL:.0%}]"]
+        head += [f"{titles[identity]} without", "with", f"cost [{LEVEL:.0%}]"]
         for label, found in cells.items():
             row = rows.setdefault(label, [])
             if found is None:

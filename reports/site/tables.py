@@ -11,6 +11,7 @@ from typing import Any
 from ihbench.clock.ledger import in_order
 from ihbench.config_fields import as_json
 from ihbench.document.marks import marks_by_interval
+from ihbench.document.metric_names import variants_told
 from ihbench.errors import BadInput
 from ihbench.metrics import Identity, macro_mean
 from ihbench.metrics.identity import metric_of
@@ -48,6 +49,7 @@ def site_tables(results: Sequence[RunResult], left_out: Sequence[str] = ()) -> J
             _run(run, of_group[k], labels.get(k, run.about.label or run.method)) for k, run in enumerate(results)
         ],
         "metrics": {name: _metric(name) for name in dict.fromkeys(i.metric for run in results for i in _scored(run))},
+        "variants": {name: said for group in groups for name, said in group.pop("variants").items()},
         "left_out": list(left_out),
         "citations": _citations(dict.fromkeys(run.method for run in results)),
     }
@@ -92,6 +94,7 @@ def _group(runs: Sequence[RunResult], done: Sequence[RunResult], numbers: Mappin
         "standin": runs[0].about.standin or "",
         "headline": next((run.headline for run in done), ""),
         "identities": [{"name": str(i), "metric": i.metric, "region": i.region} for i in identities],
+        "variants": {str(i): said for i, said in variants_told(identities).items() if said},
         "absent": absent,
         "common": common,
         "rows": _rows(done, identities, numbers, common),

@@ -9,8 +9,9 @@ import pytest
 
 from ihbench.clock.events import LeftOut, RolledBack, Warned
 from ihbench.clock.machine import Machine
+from ihbench.record.quality_time import Target
 from ihbench.record.results import RunResult
-from ihbench.record.schema import PredictionFiles
+from ihbench.record.schema import CurvePoint, PredictionFiles
 from ihbench.reports.general.headline import write as headline
 from ihbench.reports.general.report import MARKDOWN as write
 from ihbench.reports.site.tables import site_tables
@@ -275,6 +276,33 @@ def test_fewer_scenes_of_one_comparison_can_be_significant_beside_more_of_anothe
     runs = [run(f"s{k}", name, psnr=v + d * k) for name, (n, v, d) in scores.items() for k in range(n)]
     line = next(line for line in write(runs).splitlines() if line.startswith("- PSNR: a against c"))
     assert "p = 0.031 (sign-flip test over 6 scenes, Holm over 2), significant" in line
+
+
+def test_two_definitions_of_a_metric_are_told_apart_wherever_they_stand():
+    other, runs = "psnr/occnerf-pooled/range1/body/v1", []
+    for k in range(3):
+        for name, psnr in (("ours", 20.0 + k), ("theirs", 19.0 + 2 * k)):
+            one = run(f"s{k}", name, psnr=psnr, fit_seconds=10.0 + psnr)
+            one.rows[name].update(mean(other, 30.0 + psnr))
+            point = CurvePoint(1, 5.0, {i: m.value for i, m in one.own.items()})
+            runs.append(replace(one, curve=[point, replace(point, seconds=9.0)]))
+    text = write(runs, targets=[Target("psnr", 15.0)])
+    assert "PSNR (pooled) ≥ 15 dB" in text
+    assert re.search(r"- PSNR \(occnerf-pooled\): \w+ against", text)
+    for head in re.findall(r"^\| (?:method|region) .*\|$", text + "\n".join(headline(runs).splitlines()), re.M):
+        cells = head.split(" | ")
+        assert len(set(cells)) == len(cells)
+    assert "PSNR (pooled), SSIM, PSNR (occnerf-pooled)" in text  # of the Pareto set
+    for title, there in (("Error against run time", "21.00"), ("body: mean over scenes and 95% interval", "21.00 [")):
+        cells = row(text, "ours", title)  # under the right head
+        assert cells["PSNR (pooled) ↑"].startswith(there)
+        assert cells["PSNR (occnerf-pooled) ↑"].startswith(there.replace("2", "5", 1))
+    (shown,) = [line.split() for line in headline(runs).splitlines() if line.startswith("ours ")]
+    assert shown[1:4] == ["21.00", "0.5000", "51.00"]
+    (titles,) = [line for line in headline(runs).splitlines() if line.startswith("region ")]
+    assert titles.index("(pooled)") < titles.index("SSIM") < titles.index("(occnerf-pooled)")
+    assert all(name in headline(runs) for name in ("PSNR (pooled) ↑", "PSNR (occnerf-pooled) ↑"))
+    assert site_tables(runs)["variants"] == {PSNR.format("body"): "(pooled)", other: "(occnerf-pooled)"}
 
 
 def test_a_preset_scored_later_has_a_table_of_its_own():

@@ -81,7 +81,8 @@ function seconds(value) {
 
 function titled(identity) {
   const metric = metricOf(identity);
-  return `${metric.title} ${regionOf(identity).replace("_", " ")} ${metric.arrow}`;
+  const variant = DATA.variants[identity]; // of metrics called alike
+  return `${metric.title} ${regionOf(identity).replace("_", " ")} ${variant ? `${variant} ` : ""}${metric.arrow}`;
 }
 
 // --- pictures and other files of the site: beside the page, or inside it ---
