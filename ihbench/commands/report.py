@@ -75,12 +75,15 @@ def main(argv: list[str]) -> int:
     for name in chosen.preset:
         find_preset(name)
     results, left_out = read_results(chosen.run) if chosen.run else _matching(chosen)
+    results = [run for run in results if chosen.matches(run)]
     say_left_out(left_out)
     if not results:
-        raise BadInput(
-            f"no run folders under {chosen.runs} match; "
-            "make one with: ihbench run --protocol zju_occ --scene standin-1"
+        where = (
+            "none of the run folders that are named matches"
+            if chosen.run
+            else f"no run folders under {chosen.runs} match"
         )
+        raise BadInput(f"{where}; make one with: ihbench run --protocol zju_occ --scene standin-1")
     whole = chosen.full or chosen.fragment or chosen.format or chosen.out or chosen.figures
     named = *chosen.preset, *chosen.target, *chosen.rows, *chosen.metrics, *chosen.regions, *chosen.names
     if _on_terminal() and not whole and not named:

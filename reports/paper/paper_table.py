@@ -29,12 +29,14 @@ from ihbench.document.document import (
 )
 from ihbench.document.marks import marks_by_interval, marks_by_value
 from ihbench.document.short_names import Footnotes, split_label
+from ihbench.errors import BadInput
 from ihbench.metrics import Identity, Mean, macro_mean
 from ihbench.metrics.statistics import Interval, mean_interval
 from ihbench.record.results import RunResult, group_row, grouped
 from ihbench.record.row_choice import EVERYTHING, Choice
 from ihbench.record.row_labels import by_label
 from ihbench.record.scene_means import scene_means
+from ihbench.registry import nearest
 from ihbench.reports.general.remarks import lacking, row_footnotes
 from ihbench.reports.general.significance import LEVEL
 from ihbench.reports.paper.comparison import as_the_profile_has_it, beaten_notes, rank_note
@@ -85,7 +87,7 @@ def build_frame(
     run folders that could not be read, with the reasons. Raises `BadInput` for a choice of what there is not.
     """
     footnotes = Footnotes()
-    names = _check(choice, table, results)
+    names = _check(choice, region, table, results)
     table = _columns_of(table, choice)
     quoted = _quoted(table, footnotes, as_printed, choice)  # first: its letters are the same whatever is measured
     measured = [
@@ -109,13 +111,16 @@ def build_frame(
 # ---------------------------------------------------------------------------------------------------- quoted rows
 
 
-def _check(choice: Choice, table: PaperTable, results: Sequence[RunResult]) -> dict[str, str]:
+def _check(choice: Choice, region: str, table: PaperTable, results: Sequence[RunResult]) -> dict[str, str]:
     """Label -> the new name of a row. Raises `BadInput` for words that name nothing here."""
     labels = {row.name: row.name for row in table.rows}
     for runs in _by_kind(table, results).values():
         labels |= {label: having[0].method for label, having in by_label(_configured(runs)).items()}
     having = [i for run in results for scores in run.rows.values() for i in scores]
-    choice.check(labels, [column.key for column in table.columns], [*REGIONS, *(i.region for i in having)])
+    regions = list(dict.fromkeys([*REGIONS, *(i.region for i in having)]))
+    if region and region not in regions:
+        raise BadInput(f"--region {region}: there is none here: {nearest(region, regions)}")
+    choice.check(labels, [column.key for column in table.columns], regions)
     return choice.renamed(labels)
 
 

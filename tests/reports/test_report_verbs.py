@@ -99,6 +99,7 @@ def test_what_the_linter_does_not_understand_goes_to_stderr(ihbench, tmp_path):
         (["table1", "--runs", "nowhere"], "--runs nowhere: no such folder"),
         (["table1", "--format", "pdf"], "--format"),
         (["table2", "--regin", "full"], "--region"),
+        (["table1", "--region", "hiden"], "--region hiden: there is none here: did you mean 'hidden'?"),
         (["table3"], "table3: not a run folder"),
     ],
 )
@@ -109,6 +110,34 @@ def test_bad_input_is_one_line_and_status_2(ihbench, tmp_path, words, told):
     assert told in outcome.err
     assert outcome.err.count("\n") == 1
     assert outcome.out == ""
+
+
+def test_filters_choose_among_the_run_folders_that_are_named(ihbench, tmp_path):
+    runs = [
+        write_run(tmp_path / "runs", scene, method, 20.0, 0.9, profile=profile, protocol=protocol)
+        for scene, method, profile, protocol in (
+            ("a", "mine", "quick", "zju_occ@1"),
+            ("b", "other", "quick", "zju_occ@1"),
+            ("b", "mine", "paper", "ocmotion@1"),
+        )
+    ]
+    whole = ihbench("report", *runs, "--format", "md").out
+    for words in (
+        ("--method", "mine"),
+        ("--scene", "b"),
+        ("--profile", "paper"),
+        ("--protocol", "zju_occ"),
+        ("--protocol", "ocmotion@1"),
+    ):
+        outcome = ihbench("report", *runs, *words, "--format", "md")
+        assert outcome.status == 0
+        named, found = (
+            sorted(text.splitlines()) for text in (outcome.out, ihbench("report", *words, "--format", "md").out)
+        )
+        assert named == found != sorted(whole.splitlines())
+    outcome = ihbench("report", *runs, "--scene", "nobody")
+    assert outcome.status == 2
+    assert "none of the run folders that are named matches" in outcome.err
 
 
 def test_a_damaged_run_is_named_and_left_out(ihbench, tmp_path):

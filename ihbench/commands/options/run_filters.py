@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ihbench.record.results import RunResult
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,6 +22,14 @@ class RunFilters:
     """Only runs on this scene."""
     profile: str | None = None
     """Only runs under this profile."""
+
+    def matches(self, run: RunResult) -> bool:
+        """Whether a run is among those that are asked for."""
+        who = run.identity
+        asked = ((self.method, who.method), (self.scene, who.scene), (self.profile, who.profile))
+        return all(word in (None, own) for word, own in asked) and (
+            self.protocol in (None, who.protocol, who.protocol_id)
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
