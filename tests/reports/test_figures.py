@@ -9,6 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
+from ihbench.commands.pages.figures import FiguresOptions, _folders
 from ihbench.document.picture_sheet import LETTERS, Panel, PictureSheet, _heads
 from ihbench.errors import BadInput
 from ihbench.files.images import read_image
@@ -26,10 +27,12 @@ from ihbench.methods.inpainthuman.studies.multi_scale_figure import (
 from ihbench.metrics.eight_bit import displayed
 from ihbench.record.finished_run import FinishedRun
 from ihbench.record.schema import score_lines
+from ihbench.record.store import RunFolder
 from ihbench.reports.figures.side_by_side import ablation, occluded_views, visual
 from ihbench.reports.figures.teaser import teaser
 from ihbench.scene.sightings import FINE
 from ihbench.scoring.contact_sheet import OCCLUDER
+from tests.reports.fake_runs import write_run
 
 
 def plain(*size: int) -> np.ndarray:
@@ -196,6 +199,24 @@ def test_an_outline_leaves_the_inside():
     assert (drawn[:3] == 7).all()
 
 
+def test_what_no_figure_shows_is_named(tmp_path, capsys):
+    runs = tmp_path / "runs"
+    done, damaged, failed, other = (
+        write_run(runs, scene, method, 20.0, 0.9)
+        for scene, method in (("a", "m"), ("b", "m"), ("c", "m"), ("d", "n"))
+    )
+    (damaged / "scores.jsonl").write_text("{}\n")
+    RunFolder.open(failed).set_status("failed", "it fell")
+    assert _folders(FiguresOptions("visual", (runs,), method=("m",))) == [done]
+    said = capsys.readouterr().err.splitlines()
+    assert [f"left out: {folder}" in line for folder, line in zip((damaged, failed), said, strict=True)] == [
+        True,
+        True,
+    ]
+    assert "it fell" in said[1]
+    assert _folders(FiguresOptions("visual", (runs,), scene=("d",))) == [other]
+
+
 def test_the_command_writes_three_files_and_refuses_what_it_cannot_draw(bench_with_run, tmp_path):
     outcome = bench_with_run("figures", "visual", bench_with_run.runs, "--views", 1, "--out", tmp_path / "f")
     assert outcome.status == 0, outcome.err
@@ -205,7 +226,8 @@ def test_the_command_writes_three_files_and_refuses_what_it_cannot_draw(bench_wi
         (("viusal",), "did you mean 'visual'"),
         (("visual", tmp_path / "nothing"), "nothing"),
         (("visual", bench_with_run.runs, "--views", 0), "--views"),
-        (("visual", bench_with_run.runs, "--scene", "standin-7"), "no finished run matches"),
+        (("visual", bench_with_run.runs, "--scene", "standin-7"), "--scene standin-7: no run here has it"),
+        (("visual", bench_with_run.runs, "--method", "inpainthumann"), "did you mean 'inpainthuman'?"),
         (("inpaint", bench_with_run.runs), "no saved state"),
     ):
         outcome = bench_with_run("figures", *words, "--out", tmp_path / "g")

@@ -10,6 +10,7 @@ import tyro
 
 from ihbench import registry
 from ihbench.commands.options.parse import options
+from ihbench.commands.report import say_left_out
 from ihbench.errors import BadInput
 from ihbench.record import outputs
 
@@ -57,7 +58,8 @@ def main(argv: list[str]) -> int:
 
 
 def _folders(chosen: FiguresOptions) -> list[Path]:
-    """The finished runs that are asked for, in a settled order."""
+    """The finished runs that are asked for, in a settled order; what is left out of them is said on stderr. Raises
+    `BadInput` for a person or a method of which there is no run, and where none is finished."""
     from ihbench.record.results import read_results
 
     named = chosen.run or (Path("runs"),)
@@ -67,13 +69,16 @@ def _folders(chosen: FiguresOptions) -> list[Path]:
             folders.append(folder)
         else:
             folders += sorted(path.parent for path in folder.glob("*/run.json"))
-    results, _ = read_results(folders) if folders else ([], [])
-    wanted = [
-        result
-        for result in results
-        if result.scene in (chosen.scene or (result.scene,)) and result.method in (chosen.method or (result.method,))
-    ]
+    results, left_out = read_results(folders) if folders else ([], [])
+    wanted = results
+    for name, words in (("scene", chosen.scene), ("method", chosen.method)):
+        known = sorted({getattr(result, name) for result in results})
+        for word in words if results else ():
+            if word not in known:
+                raise BadInput(f"--{name} {word}: no run here has it: {registry.nearest(word, known)}")
+        wanted = [result for result in wanted if not words or getattr(result, name) in words]
     done = [result.folder for result in wanted if result.status == "done"]
+    say_left_out([*left_out, *(f"{result.folder}: {result.outcome}" for result in wanted if result.status != "done")])
     if not done:
         where = ", ".join(map(str, named))
         raise BadInput(
