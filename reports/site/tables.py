@@ -3,6 +3,7 @@ runs themselves with every score of every test view, curves, stages, and how to 
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -355,7 +356,11 @@ def _value(value: Any) -> str:
     if value is None:
         return '""'
     if isinstance(value, str):
-        return '"' + value.translate({0x22: '\\"', 0x5C: "\\\\", 0x0A: "\\n"}) + '"'
+        return json.dumps(value, ensure_ascii=False).replace(
+            "\x7f", "\\u007f"
+        )  # TOML's strings are JSON's but for this
+    if isinstance(value, Mapping):  # in a list
+        return f"{{{', '.join(f'{_key(name)} = {_value(inner)}' for name, inner in value.items())}}}"
     if isinstance(value, Sequence):
         return f"[{', '.join(map(_value, value))}]"
     return str(value)

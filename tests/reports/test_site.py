@@ -16,6 +16,7 @@ import pytest
 import torch
 from PIL import Image
 
+from ihbench import registry
 from ihbench.body import load_body
 from ihbench.body.pose import BodyPose
 from ihbench.body.uv import texel_table
@@ -35,6 +36,7 @@ from ihbench.reports.site import avatars, baking, build, corrections, moving, pa
 from ihbench.reports.site.frames import REGIONS, Files, OpenScenes
 from ihbench.reports.site.server import Followed, handler, own_port
 from ihbench.scene.mask_state import MaskState
+from ihbench.scene.protocol import load_protocol
 from ihbench.scene.sightings import FINE
 from ihbench.scoring.scoring import Scorer
 from ihbench.show.subject import Subject
@@ -123,8 +125,15 @@ def test_methods_with_other_scenes_are_compared_over_what_all_have():
 def test_what_a_protocol_says_survives_as_toml():
     content = {
         "title": 'a "quoted" \\ line\nof two', "size": 3, "share": 0.5, "on": True, "nothing": [],
-        "of": {"rows": [1, [2, "x"]], "deeper": {"odd key!": "é", "empty": {}}}, "late": "value",
+        "of": {"rows": [1, [2, "x"]], "deeper": {"odd key!": "é", "empty": {}}}, "late": "\t\r\x7f",
+        "several": [{"a b": 1, "c": {"d": [True]}}, {}],
     }  # fmt: skip
+    assert tomllib.loads(tables.toml(content)) == content
+
+
+@pytest.mark.parametrize("name", registry.names("protocol"))
+def test_every_shipped_protocol_survives_as_toml(name):
+    content = json.loads(json.dumps(load_protocol(name, "quick").content))  # as a record has it
     assert tomllib.loads(tables.toml(content)) == content
 
 
