@@ -206,6 +206,8 @@ def read_result(folder: Path) -> RunResult:
     rows = mean_rows([*own, *others])
     if run.status == "done" and method not in rows:
         raise BadInput(f"{folder}: is done, but its scores are gone; run the same command with --force")
+    if run.status == "done" and (fault := _views_lost(record, own)):
+        raise BadInput(f"{folder}: its scores are not whole ({fault}); run the same command with --force")
     presets: dict[str, Rows] = {}
     curve: list[CurvePoint] = []
     damage: list[str] = []
@@ -213,7 +215,8 @@ def read_result(folder: Path) -> RunResult:
         try:
             _, lines = preset_lines(file)
             mine, others = ([x for x in lines if _is_row_of(method, x.row) is own] for own in (True, False))
-            if fault := _mixed_up(method, mine, others) if mine else f"no row of {method[:80]!a}":
+            fault = _mixed_up(method, mine, others) if mine else f"no row of {method[:80]!a}"
+            if fault := fault or _views_lost(record, mine):
                 raise BadInput(f"{file}: {fault}")
             presets[file.stem] = mean_rows(lines)
         except BadInput as error:
@@ -284,6 +287,17 @@ def _mixed_up(method: str, own: Sequence[ScoreLine], others: Sequence[ScoreLine]
             if views != every:
                 return f"{row[:80]!a} has {len(views)} of {len(every)} test views"
     return ""
+
+
+def _views_lost(record: RunRecord, own: Sequence[ScoreLine]) -> str:
+    """How many test views the rows of the method or of the predictions have too few or too many, those of further
+    groups among them; "" where none, or where the record does not say how many there are. A view without a prediction
+    has scores, too: absent ones."""
+    files, measured = record.about.predictions, (record.about.measure or {}).get("test_views")
+    expected = measured if files is None else files.views
+    return (
+        f"{len(own)} of {expected} test views" if isinstance(expected, int) and expected not in (0, len(own)) else ""
+    )
 
 
 def _is_row_of(method: str, row: str) -> bool:
