@@ -72,7 +72,7 @@ def positive_interval(seconds: Mapping[str, float | Sequence[float]], level: flo
     if not (interval.value > 0 and math.isfinite(interval.low) and interval.n < BOOTSTRAP_FROM):
         return interval
     low, high = (interval.value * math.exp(end / interval.value - 1) for end in (interval.low, interval.high))
-    return replace(interval, low=low, high=high, method=f"{interval.method}, of seconds in their logarithm")
+    return replace(interval, low=low, high=high, method=f"{interval.method}, in log time")
 
 
 def fit_cpu_seconds(run: RunResult) -> float | None:

@@ -11,7 +11,7 @@ from statistics import median
 
 import numpy as np
 
-from ihbench.document.document import Block, Heading, Paragraph, Table, Words, bullets
+from ihbench.document.document import Block, Heading, Paragraph, Span, Table, Words, bullets
 from ihbench.document.metric_names import heads, named, variants_told
 from ihbench.metrics import Identity
 from ihbench.metrics.statistics import Interval, mean_interval, median_interval
@@ -251,17 +251,29 @@ def _time_table(
         head.append(f"{metric.title}{where} {sign} {target.value * metric.scale:g}{unit}")
     if not columns or not configs:
         return bullets(missing)
-    rows = [(c.label, *(_time_cell(c, target, i) for target, i in columns)) for c in configs]
+    below: dict[str, str] = {}  # what is said of cells -> its number
+    rows = []
+    for c in configs:
+        row: list[Words] = [c.label]
+        for shown, says in (_time_cell(c, target, i) for target, i in columns):
+            mark = says and Span(below.setdefault(says, f"({len(below) + 1})"), "raised")
+            row.append((f"{shown} ", mark) if mark else shown)
+        rows.append(tuple(row))
     note = (
         f"Seconds of fitting until the quality was first reached on {views} test views (region "
-        f"{headline} where none is named); where the table over all views says otherwise, the cell says so. Median "
-        "over scenes of the median over seeds, in brackets the order "
-        f"statistics that hold the true median with {SPREAD} confidence, or, under 6 scenes, their range. Between "
-        "two checkpoints quality is taken as linear in log time. Targets are stated with --target psnr=25; else they "
-        "are round numbers that the curves pass."
+        f"{headline} where none is named); where the table over all views says otherwise, a number at the cell leads "
+        "to what it says. Median over scenes of the median over seeds, in brackets the order "
+        f"statistics that hold the true median with {SPREAD} confidence, or, under 6 scenes, their range; behind it "
+        "in how many scenes the quality was reached, where not in all. Between two checkpoints quality is taken as "
+        "linear in log time. Targets are stated with --target psnr=25; else they are round numbers that the curves "
+        "pass."
     )
     title = f"Time to quality, on {views} test views"
-    return [Heading(3, title), Table(tuple(head), tuple(rows)), Paragraph(note), *bullets(missing)]
+    said: list[str | Span] = []
+    for text, mark in below.items():
+        said += [*([" "] if said else []), Span(mark, "raised"), f" {text}."]
+    paragraphs = [Paragraph(tuple(said))] if said else []
+    return [Heading(3, title), Table(tuple(head), tuple(rows)), *paragraphs, Paragraph(note), *bullets(missing)]
 
 
 def _round_ones(configs: Sequence[Configuration], identity: Identity) -> list[float]:
@@ -272,30 +284,30 @@ def _round_ones(configs: Sequence[Configuration], identity: Identity) -> list[fl
     return round_targets(kept) or round_targets([curve for *_, curve in every])
 
 
-def _time_cell(configuration: Configuration, target: float, identity: Identity) -> str:
-    """Median seconds; with the views that it stands on wherever the table over all views says something else."""
+def _time_cell(configuration: Configuration, target: float, identity: Identity) -> tuple[str, str]:
+    """Median seconds; and, wherever the table over all views says something else, what it says, with the views that
+    the seconds stand on."""
     found, metric = curves(configuration, identity), identity.display
     by_scene = grouped((scene, time_to_quality(curve, target)) for (scene, _), curve in found.items())
     times = {scene: median(seconds) for scene, seconds in by_scene.items()}  # `NEVER` where half never get there
     if not times:
-        return "—"
+        return "—", ""
     views = f"on {standing(run for run in configuration.runs if run.scene in times)} views"
     table = in_table(configuration, identity, times)
     has = {scene: value >= target if metric.higher_is_better else value <= target for scene, value in table.items()}
     says = ""
     if any(math.isfinite(times[scene]) != has[scene] for scene in times):
         of_all = f"it in {sum(has.values())} of {len(has)} scenes" if len(has) > 1 else metric.text(*table.values())
-        says = f"; the table has {of_all}"
+        says = f"{views}; the table has {of_all}"
     reached = sum(map(math.isfinite, times.values()))
     if not reached:
         best = (max if metric.higher_is_better else min)(curve.best for curve in found.values())
-        return f"never (best {metric.text(best)} {views}{says})"
+        return f"never (best {metric.text(best)})", says
     interval = median_interval(times, LEVEL)
     shown = _seconds(interval.value)
     if not math.isnan(interval.low):
         shown += f" [{_seconds(interval.low, '')}, {_seconds(interval.high, '')}]"
-    shown += f", {reached} of {len(times)} scenes" if reached < len(times) else ""
-    return f"{shown} {views}{says}" if says else shown
+    return shown + (f", {reached} of {len(times)}" if reached < len(times) else ""), says
 
 
 def _end_table(configs: Sequence[Configuration], views: str, columns: Sequence[Identity]) -> list[Block]:
