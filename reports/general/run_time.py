@@ -211,6 +211,8 @@ def _cost_table(configs: Sequence[Configuration], identities: Sequence[Identity]
 
 def _quality_times(configs: Sequence[Configuration], headline: str, targets: Sequence[Target]) -> list[Block]:
     known = curve_identities(configs)
+    if not known and any(run.curve for c in configs for run in c.runs):
+        return [Paragraph("The quality-time curves (curve.jsonl) hold none of the metrics and regions shown here.")]
     if not known:
         return [Paragraph("No run has a quality-time curve (curve.jsonl).")]
     without = [run.folder.name for c in configs for run in c.runs if not run.curve]

@@ -218,6 +218,16 @@ def test_a_metric_that_is_not_on_the_curve_is_named(tmp_path):
     assert "no curve of lpips in body" in section([made_up(tmp_path)], Target("lpips", 0.1))
 
 
+def test_curves_that_lack_what_is_shown_are_told_from_no_curves(tmp_path):
+    run = made_up(tmp_path)
+    without = replace(run, curve=[replace(point, scores={}) for point in run.curve])  # as --metrics lpips leaves them
+    assert "The quality-time curves (curve.jsonl) hold none of the metrics and regions shown here." in section(
+        [without]
+    )
+    assert "No run has a quality-time curve" not in section([without])
+    assert "No run has a quality-time curve (curve.jsonl)." in section([made_up(tmp_path, "b", curve=None)])
+
+
 def test_without_targets_round_ones_are_taken_that_the_curves_pass(tmp_path):
     head = section([made_up(tmp_path)]).split("### Time to quality")[1].splitlines()[2]
     targets = [float(x) for x in re.findall(r"PSNR ≥ ([\d.]+) dB", head)]
