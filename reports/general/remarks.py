@@ -3,7 +3,7 @@ and the fits themselves left out, and what else the fits warn of."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
 from ihbench.clock.events import LeftOut, RolledBack, Warned
 from ihbench.document.metric_names import named
@@ -16,32 +16,38 @@ PLAN, FIT, BACK, WARNING = "left out by the plan", "left out by the fit", "rolle
 
 def remarks(runs: Sequence[RunResult]) -> list[str]:
     """One line for each remark on some rows' finished runs, with the rows and scenes that it is of."""
-    absent: dict[tuple[str, str], list[str]] = {}
-    partly: dict[tuple[str, str, str], list[str]] = {}
     notes: list[str] = []
-    names = named(i for run in runs for i in run.own)
-    for run in runs:
-        for identity, mean in run.own.items():
-            metric, region = names[identity], identity.region
-            if mean.absent:
-                absent.setdefault((metric, mean.reason), []).append(region)
-            elif mean.note:
-                partly.setdefault((run.scene, region, mean.note), []).append(metric)
-        files = run.about.predictions
-        remarks = () if files is None else (*files.notes, *files.doubts)
-        notes += [f"{run.method} on {run.scene}: {note}" for note in remarks]
-        notes += [f"{run.method} on {run.scene}: not shown: {damage}" for damage in run.damage]
-    for label, group in by_label(runs).items():
+    rows, names = by_label(runs), named(i for run in runs for i in run.own)
+    for label, group in rows.items():
         if lacks := lacking(group, runs):
             notes.append(f"{label}: {lacks}")
         for kind in (PLAN, FIT, BACK, WARNING):
             for text, having in _runs_by_text(group, kind).items():
                 notes.append(f"{kind}, {label} on {_scenes(having)}{_share(having, group)}: {text}")
-    for (scene, region, note), metrics in partly.items():
-        notes.append(f"{region} of {scene} ({', '.join(dict.fromkeys(metrics))}): {note}")
-    for (metric, reason), regions in absent.items():
-        notes.append(f"absent: {metric}, {', '.join(dict.fromkeys(regions))}: {reason}")
+    for run in runs:
+        files = run.about.predictions
+        said = () if files is None else (*files.notes, *files.doubts)
+        notes += [f"{run.method} on {run.scene}: {note}" for note in said]
+        notes += [f"{run.method} on {run.scene}: not shown: {damage}" for damage in run.damage]
+    scored = [(label, run, i, mean) for label, group in rows.items() for run in group for i, mean in run.own.items()]
+    partly = (
+        ((label, run.scene, i.region, mean.note), names[i]) for label, run, i, mean in scored if not mean.absent
+    )
+    absent = (((label, names[i], mean.reason), i.region) for label, _, i, mean in scored if mean.absent)
+    for (scene, region, note), metrics, of in _alike(((key, metric) for key, metric in partly if key[-1]), rows):
+        notes.append(f"{region} of {scene} ({metrics}){of}: {note}")
+    for (metric, reason), regions, of in _alike(absent, rows):
+        notes.append(f"absent: {metric}, {regions}{of}: {reason}")
     return sorted(set(notes))
+
+
+def _alike(
+    found: Iterable[tuple[tuple[str, ...], str]], rows: Collection[str]
+) -> Iterator[tuple[tuple[str, ...], str, str]]:
+    """(row, key...) with a word each -> key, its words, and the rows that have just these: ", ours"; "" for all."""
+    words = {key: ", ".join(dict.fromkeys(those)) for key, those in grouped(found).items()}
+    for (key, those), labels in grouped(((key[1:], those), key[0]) for key, those in words.items()).items():
+        yield key, those, "" if len(labels) == len(rows) else f", {', '.join(labels)}"
 
 
 def lacking(row: Sequence[RunResult], block: Sequence[RunResult]) -> str:

@@ -205,6 +205,16 @@ def test_views_that_a_mean_does_not_run_over_are_counted():
     assert "- body of a (PSNR): 2 of 4 without any error (inf) left out" in text
 
 
+def test_a_remark_on_some_rows_names_them():
+    runs = [run(method=name) for name in ("ours", "theirs", "third")]
+    for own in runs[:2]:
+        own.rows[own.method].update(mean(PSNR.format("body"), 20.0, n=9, infinite=1))
+    runs[2].rows["third"].update(mean(SSIM.format("full"), math.nan, "no such file"))
+    text = write(runs)
+    assert "- body of a (PSNR), ours, theirs: 1 of 10 without any error (inf) left out\n" in text
+    assert "- absent: SSIM, full, third: no such file\n" in text
+
+
 def test_a_row_says_which_scenes_and_seeds_it_lacks():
     runs = [run(scene, seed=seed) for scene in "abc" for seed in (0, 1)]
     runs += [run("a", "few"), run("c", "few", seed=1), run("a", "few", seed=1)]
