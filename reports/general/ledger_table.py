@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import chain
@@ -11,6 +11,7 @@ from itertools import chain
 from ihbench.clock.ledger import REDONE, LedgerState, in_order
 from ihbench.document.document import Block, Heading, Paragraph, Table, Words, bullets, emphasis, strong
 from ihbench.record.results import RunResult
+from ihbench.record.scene_means import seed_means
 from ihbench.record.schema import RunRecord
 from ihbench.reports.general.clock import by_machine
 
@@ -63,6 +64,9 @@ class Account:
         return math.isnan(self.stamped) or abs(self.wall - self.stamped) <= STAMPED + TOLERANCE * self.stamped
 
 
+Books = Sequence[tuple[RunResult, Account]]  # of the runs of a row
+
+
 def account(run: RunResult) -> Account | None:
     """The books of a run; None when it left none."""
     ledger = run.record.ledger
@@ -81,36 +85,42 @@ def ledger_section(runs: Sequence[RunResult]) -> list[Block]:
     blocks: list[Block] = [Heading(3, "What the seconds include")]
     labels = list(rows)
     for k in range(0, len(labels), ROWS_AT_ONCE):
-        blocks.append(_table({label: [a for _, a in rows[label]] for label in labels[k : k + ROWS_AT_ONCE]}))
+        blocks.append(_table({label: rows[label] for label in labels[k : k + ROWS_AT_ONCE]}))
     return [*blocks, *_check([pair for pairs in rows.values() for pair in pairs])]
 
 
-def _table(columns: dict[str, list[Account]]) -> Table:
-    paths = in_order(dict.fromkeys(path for accounts in columns.values() for a in accounts for path in a.stages))
+def _table(columns: dict[str, Books]) -> Table:
+    paths = in_order(dict.fromkeys(path for books in columns.values() for _, a in books for path in a.stages))
     lines: list[tuple[Words, ...]] = []
     for path in paths:
         cells = [
-            _cells([a.stages[path] for a in accounts if path in a.stages], accounts) for accounts in columns.values()
+            _cells(books, lambda a, path=path: a.stages.get(path, 0.0))
+            if any(path in a.stages for _, a in books)
+            else ["", ""]
+            for books in columns.values()
         ]
         lines.append((INDENT * path.count("/") + path.rpartition("/")[2], *chain(*cells)))
-    unnamed = chain(*(_cells([a.unnamed for a in accounts], accounts) for accounts in columns.values()))
-    total = chain(*(_cells([a.wall for a in accounts], accounts) for accounts in columns.values()))
+    unnamed = chain(*(_cells(books, lambda a: a.unnamed) for books in columns.values()))
+    total = chain(*(_cells(books, lambda a: a.wall) for books in columns.values()))
     lines += [(emphasis(UNNAMED), *unnamed), (strong(TOTAL), *total)]
     head: list[Words] = ["stage"]
-    for label, accounts in columns.items():
-        head += [f"{label}: s (mean of {len(accounts)} run{'s' * (len(accounts) > 1)})", "%"]
+    for label, books in columns.items():
+        head += [f"{label}: s (mean of {len(books)})", "%"]
     return Table(tuple(head), tuple(lines))
 
 
-def _cells(parts: Sequence[float], accounts: Sequence[Account]) -> list[Words]:
-    """Mean seconds and their share of the wall clock; empty where no account has the stage."""
-    if not parts:
-        return ["", ""]
-    seconds, wall = (math.fsum(values) / len(accounts) for values in (parts, (a.wall for a in accounts)))
+def _cells(books: Books, seconds_of: Callable[[Account], float]) -> list[Words]:
+    """Mean seconds, over the seeds of a scene, then over scenes, and their share of the wall clock."""
+    seconds, wall = (_mean((run.scene, value(a)) for run, a in books) for value in (seconds_of, lambda a: a.wall))
     return [f"{seconds:.2f}", f"{100 * seconds / wall:.1f}" if wall > 0 else "—"]
 
 
-def _check(pairs: Sequence[tuple[RunResult, Account]]) -> list[Block]:
+def _mean(seconds: Iterable[tuple[str, float]]) -> float:
+    means = seed_means(seconds)
+    return math.fsum(means.values()) / len(means)
+
+
+def _check(pairs: Books) -> list[Block]:
     shares = [a.unnamed_share for _, a in pairs]
     good = sum(a.adds_up for _, a in pairs)
     stamped = [a for _, a in pairs if not math.isnan(a.stamped)]

@@ -40,6 +40,17 @@ def test_rows_add_up_to_the_wall_clock_with_what_is_in_no_stage(tmp_path):
     assert sum(top) == pytest.approx(56.60)
 
 
+def test_every_scene_counts_once(tmp_path):
+    """As in the other tables of seconds: two seeds of one scene are one scene."""
+    runs = [
+        made_up(tmp_path, s, seed=k, fit=f, stages={f"of {s}": 8.0})
+        for s, k, f in (("a", 0, 10.0), ("a", 1, 30.0), ("b", 0, 60.0))
+    ]
+    rows = table(runs)
+    assert rows["fit"][0] == "40.00"
+    assert rows["of b"][0] == "4.00"
+
+
 def test_more_than_two_percent_in_no_stage_is_named(tmp_path):
     fine, leaky = made_up(tmp_path, unnamed=0.9), made_up(tmp_path, seed=1, unnamed=1.5)
     assert account(fine).adds_up
