@@ -79,7 +79,7 @@ def beaten_notes(table: PaperTable, group: str, scores: Mapping[tuple[str, Colum
         ]
         if parts:
             notes.append(f"{group}, region {region}: better than {ours}: {'. '.join(parts)}.")
-    return notes or [f"{group}: no other system measured here is better than {ours} in any region."]
+    return notes or [f"{group}: no other system measured here is better than {ours} in any region by these metrics."]
 
 
 def _better(ours: str, column: Column, scores: Scores) -> Iterator[str]:

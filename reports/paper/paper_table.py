@@ -237,11 +237,11 @@ def _parts(table: PaperTable) -> list[str]:
 # -------------------------------------------------------------------------------------------------- measured rows
 
 
-def _by_kind(table: PaperTable, results: Sequence[RunResult]) -> dict[tuple[str, str], list[RunResult]]:
-    """(stand-in, profile) -> runs under the table's protocols."""
+def _by_kind(table: PaperTable, results: Sequence[RunResult]) -> dict[tuple[bool, str], list[RunResult]]:
+    """(whether on a stand-in, profile) -> runs under the table's protocols."""
     protocols = {protocol for group in table.groups for protocol in group.protocols}
     runs = (run for run in results if run.identity.protocol_id in protocols)
-    return grouped(((run.about.standin or "", run.identity.profile), run) for run in runs)
+    return grouped(((bool(run.about.standin), run.identity.profile), run) for run in runs)
 
 
 def _configured(runs: Sequence[RunResult]) -> list[RunResult]:
@@ -257,11 +257,12 @@ def _measured(
     footnotes: Footnotes,
     choice: Choice,
 ) -> Iterator[Table]:
-    """One block for each combination of data, profile and protocol; real data first."""
+    """A block for each profile, on real data first; further ones where runs of one data set differ in protocol or
+    stand-in."""
     by_kind = _by_kind(table, results)
-    for standin, profile in sorted(by_kind, key=lambda key: (bool(key[0]), *key)):
+    for standin, profile in sorted(by_kind):
         runs = by_kind[standin, profile]
-        # runs of one data set under several protocols, digests or variants go into several blocks
+        # runs of one data set under several protocols, digests, stand-ins or variants go into several blocks
         by_protocol = grouped((run.identity.protocol_id, run.group) for run in runs)
         keys = [
             list(dict.fromkeys(k for name in g.protocols for k in by_protocol.get(name, ()))) for g in table.groups
@@ -279,7 +280,7 @@ def _measured(
 def _measured_block(
     table: PaperTable,
     filled: Sequence[tuple[Group, list[RunResult]]],  # a data set and its runs, done or not
-    standin: str,
+    standin: bool,
     profile: str,
     region: str,
     footnotes: Footnotes,
@@ -292,8 +293,9 @@ def _measured_block(
     kind: Kind = "stand-in" if standin else "real data"
     notes: list[str] = []
     if standin:
+        made = ", ".join(dict.fromkeys(run.about.standin or "" for run in everything))
         notes.append(
-            f"Made on {standin}: procedural people of the bench in the data set's layout, not the data set. These "
+            f"Made on {made}: procedural people of the bench in the data set's layout, not the data set. These "
             "numbers compare rows of this block with each other and with nothing else."
         )
     unlabelled = [run for run in everything if run.about.changed is None]

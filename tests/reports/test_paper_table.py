@@ -106,6 +106,18 @@ def test_stand_ins_and_real_data_never_share_a_block():
     assert [table.kind for table in frame.tables] == ["quoted", "quoted elsewhere", "real data", "stand-in"]
 
 
+def test_data_sets_of_stand_ins_of_several_versions_share_a_block_and_one_of_two_does_not():
+    first, second = {"standin": "stand-in v1 seed 0"}, {"standin": "stand-in v2 seed 0"}
+    furniture = {"protocol": "ocmotion_visible@2", "dataset": "ocmotion"}
+    runs = [fake_run("a", said=second), fake_run("a", psnr=30.0, said=first, who=furniture)]
+    (table,) = (one for one in build_frame(TABLE1, runs).tables if one.kind == "stand-in")
+    assert cell(table, "ours", "ZJU-MoCap", "psnr").value == 20.0
+    assert cell(table, "ours", "OcMotion, held-out frames", "psnr").value == 30.0
+    assert any("Made on stand-in v2 seed 0, stand-in v1 seed 0" in note for note in table.notes)
+    frame = build_frame(TABLE1, [*runs, fake_run("a", psnr=10.0, said=first)])
+    assert [one.kind for one in frame.tables].count("stand-in") == 2
+
+
 def test_a_cell_over_fewer_scenes_than_others_says_so():
     runs = [*on_all("whole", 20.0), fake_run("a", "few", 30.0), fake_run("b", "few", 31.0)]
     frame = build_frame(TABLE1, runs)
