@@ -65,6 +65,11 @@ def mean_cost(runs: Sequence[RunResult], cost: Callable[[RunResult], float | Non
     return math.fsum(known.values()) / len(known) if known and one_clock(runs) else None
 
 
+def three_digits(cost: float) -> str:
+    """ "0.0152", "65.8", "1061": seconds or milliseconds, never with an exponent where they are many."""
+    return f"{cost:.0f}" if abs(cost) >= 999.5 else f"{cost:.3g}"
+
+
 def positive_interval(seconds: Mapping[str, float | Sequence[float]], level: float) -> Interval:
     """`mean_interval` of seconds, which are positive: Student's t is taken of the mean's logarithm (its deviation is
     that of the mean over the mean), so that no end lies below zero. Resampling needs no logarithm."""

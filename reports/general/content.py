@@ -27,7 +27,7 @@ from ihbench.metrics import Identity
 from ihbench.record.quality_time import Target
 from ihbench.record.results import RunResult, by_group
 from ihbench.record.row_labels import by_label
-from ihbench.reports.general.clock import fit_cpu_seconds, mean_cost
+from ihbench.reports.general.clock import fit_cpu_seconds, mean_cost, three_digits
 from ihbench.reports.general.inpainting import inpainting_section
 from ihbench.reports.general.ledger_table import ledger_section
 from ihbench.reports.general.remarks import remarks
@@ -199,7 +199,7 @@ def _table(
             own += [_cost(group, fit_cpu_seconds)] if of_cpu else []
             own.append(_cost(group, lambda run: run.about.total_seconds))
             own.append(f"{max(run.about.peak_mb or 0.0 for run in group):.0f}")
-            own.append(_cost(group, lambda run: run.about.render_ms, "{:.3g}"))
+            own.append(_cost(group, lambda run: run.about.render_ms, three_digits))
         lines.append((label, *about, *score_cells(group, columns, method), *own))
         for row in further_rows(group):
             name = label + row.removeprefix(method)
@@ -213,6 +213,8 @@ def _table(
     return Table(tuple(head), tuple(lines), left=3)
 
 
-def _cost(runs: list[RunResult], cost: Callable[[RunResult], float | None], shown: str = "{:.0f}") -> str:
+def _cost(
+    runs: list[RunResult], cost: Callable[[RunResult], float | None], shown: Callable[[float], str] = "{:.0f}".format
+) -> str:
     mean = mean_cost(runs, cost)
-    return "—" if mean is None else shown.format(mean)
+    return "—" if mean is None else shown(mean)

@@ -13,7 +13,7 @@ from ihbench.errors import visible
 from ihbench.metrics import Identity
 from ihbench.record.results import TRACEBACK, NotRun, RunResult, by_group
 from ihbench.record.row_labels import by_label
-from ihbench.reports.general.clock import mean_cost, waited
+from ihbench.reports.general.clock import mean_cost, three_digits, waited
 from ihbench.reports.general.remarks import lacking
 from ihbench.reports.general.significance import further_rows, score_cells
 from ihbench.scoring.calibration import ROWS
@@ -156,7 +156,7 @@ def _costs(runs: Sequence[RunResult]) -> list[str]:
     seconds, drawing = (
         mean_cost(runs, of) for of in (lambda run: run.about.fit_seconds, lambda run: run.about.render_ms)
     )
-    return ["—" if seconds is None else f"{seconds:.0f}", "" if drawing is None else f"{drawing:.3g}"]
+    return ["—" if seconds is None else f"{seconds:.0f}", "" if drawing is None else three_digits(drawing)]
 
 
 def _cut(name: str, room: int) -> str:

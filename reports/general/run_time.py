@@ -29,7 +29,14 @@ from ihbench.record.quality_time import (
 )
 from ihbench.record.results import RunResult, grouped
 from ihbench.record.scene_means import per_scene, seed_means
-from ihbench.reports.general.clock import clock_notes, fit_cpu_seconds, mean_cost, positive_interval, waited
+from ihbench.reports.general.clock import (
+    clock_notes,
+    fit_cpu_seconds,
+    mean_cost,
+    positive_interval,
+    three_digits,
+    waited,
+)
 from ihbench.reports.general.configurations import Configuration, configurations
 from ihbench.reports.general.significance import LEVEL, interval_text
 
@@ -179,12 +186,12 @@ def _cost_table(configs: Sequence[Configuration], identities: Sequence[Identity]
         cells = [
             c.label,
             str(len(c.runs)),
-            interval_text(seconds[c.label], "{:.3g}".format),
-            *([_shown(mean_cost(c.runs, fit_cpu_seconds), "{:.3g}")] if of_cpu else []),
+            interval_text(seconds[c.label], three_digits),
+            *([_shown(mean_cost(c.runs, fit_cpu_seconds))] if of_cpu else []),
             f"{seconds_interval(c.runs, 'total_seconds').value:.0f}",
             f"{max(run.about.peak_mb or 0.0 for run in c.runs):.0f}",
             *([f"{max(map(_device_mb, c.runs)):.0f}"] if on_gpu else []),
-            _shown(mean_cost(c.runs, lambda run: run.about.render_ms), "{:.3g}"),
+            _shown(mean_cost(c.runs, lambda run: run.about.render_ms)),
             *(i.display.text(row[c.label].value.value) if c.label in row else "—" for i, row in points.items()),
             ", ".join(best.get(c.label, [])) or "—",
         ]
@@ -363,12 +370,12 @@ def _area_table(configs: Sequence[Configuration], views: str, known: Sequence[Id
     return [Heading(3, title), Table(tuple(head), tuple(map(tuple, cells.values()))), Paragraph(note)]
 
 
-def _shown(cost: float | None, form: str) -> str:
-    return "—" if cost is None else form.format(cost)
+def _shown(cost: float | None) -> str:
+    return "—" if cost is None else three_digits(cost)
 
 
 def _seconds(value: float, unit: str = " s") -> str:
-    return "never" if value == NEVER else f"{value:.3g}{unit}"
+    return "never" if value == NEVER else f"{three_digits(value)}{unit}"
 
 
 def _device_mb(run: RunResult) -> float:

@@ -13,6 +13,7 @@ from ihbench.document.markdown import write as markdown
 from ihbench.metrics import Identity
 from ihbench.metrics.statistics import Interval
 from ihbench.record.quality_time import Target
+from ihbench.reports.general.clock import three_digits
 from ihbench.reports.general.configurations import configurations, sweeps
 from ihbench.reports.general.figures import ROOM, _shown, draw
 from ihbench.reports.general.headline import write as headline
@@ -39,6 +40,13 @@ def cells(text, label, title="Error against run time"):
 
 
 # --------------------------------------------------------------------------------------------------------- the costs
+
+
+@pytest.mark.parametrize(
+    ("cost", "text"), [(0.01524, "0.0152"), (65.83, "65.8"), (999.4, "999"), (999.6, "1000"), (1061.2, "1061")]
+)
+def test_costs_have_three_digits_and_no_exponent(cost, text):
+    assert three_digits(cost) == text
 
 
 def test_seconds_are_means_over_scenes_with_an_interval_and_one_scene_takes_its_repeats(tmp_path):
