@@ -164,8 +164,7 @@ class Chart:
         self.sole = body.v_template[:, 1].min()
         self.fingertips = body.v_template[:, 0].max()
         head, neck = J[JOINT_INDEX["head"]], J[JOINT_INDEX["neck"]]
-        landmarks = (0.031, head[1] + 0.085, head[1] + 0.027) if body.face_landmarks is None else body.face_landmarks
-        self.eye_x, self.eye_y, self.mouth_y = landmarks
+        self.eye_x, self.eye_y, self.mouth_y = body.eyes_and_mouth
         self.head_z = head[2]
         # round neckline, lower in front
         self.collar = self.y - (neck[1] - 0.030 - 0.35 * np.clip(self.z - neck[2], 0, 0.14))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ihbench.body import skinning_numpy
 from ihbench.body.pose import BodyPose
+from ihbench.body.skeleton import JOINT_INDEX
 from ihbench.errors import BadInput
 
 Array = NDArray[np.float64]
@@ -107,6 +108,16 @@ class Body:
     def joints(self) -> Array:
         """[24, 3] m, rest joints at zero shape coefficients."""
         return self.J_regressor @ self.v_template
+
+    @property
+    def eyes_and_mouth(self) -> tuple[float, float, float]:
+        """m, of the template: how far the eyes stand from the middle, their height, and that of the mouth. Of a body
+        file that does not say, as SMPL's does not, estimated from the head's joint."""
+        if self.face_landmarks is None:
+            head = float(self.joints[JOINT_INDEX["head"], 1])
+            return 0.031, head + 0.085, head + 0.027
+        eye_x, eye_y, mouth_y = map(float, self.face_landmarks)
+        return eye_x, eye_y, mouth_y
 
     @cached_property
     def parts(self) -> NDArray[np.int32]:
