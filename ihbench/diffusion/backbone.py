@@ -48,6 +48,7 @@ class Backbone:
     size: int
     square: bool  # trained on squares only
     prefill: bool = False  # trained with hidden pixels of the masked image filled by push-pull instead of grey
+    heads: bool = False  # trained on head crops, too
 
     @property
     def device(self) -> torch.device:
@@ -78,12 +79,15 @@ class Backbone:
         images: Tensor,  # [B, 3, H, W] in [-1, 1]
         hidden: Tensor,  # [B, 1, H, W] 1 where the model is to paint
         person: Tensor | None = None,  # [B, 1, H, W] 1 where a pixel is known to show the person
+        fill: Tensor | None = None,  # [B, 3, H, W] in [-1, 1] what hidden pixels begin with
     ) -> Tensor:
         """[B, 1 + C, h, w]: the mask, and the latents of the masked image (diffusers' order). Its hidden pixels are
-        grey, or with `prefill` carry the colours of the person around them."""
+        grey, or with `prefill` carry `fill`, and without one the colours of the person around them."""
         masked = images * (hidden < 0.5)
-        if self.prefill and person is not None:
-            masked = masked + push_pull(images, person * (hidden < 0.5)) * (hidden >= 0.5)
+        if self.prefill and fill is None and person is not None:
+            fill = push_pull(images, person * (hidden < 0.5))
+        if self.prefill and fill is not None:
+            masked = masked + fill * (hidden >= 0.5)
         masked = self.codec.encode(masked)
         return torch.cat([shrink_mask(hidden, masked), masked], 1).to(self.dtype)
 

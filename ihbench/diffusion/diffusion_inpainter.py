@@ -30,6 +30,9 @@ def check_backbone(config: InpaintConfig) -> None:
         new_words(tokenizer, config.token, config.settled().vectors, config.backbone)
 
 
+HEADS_A_CROP = 4  # head crops in the pixels of a person crop
+
+
 class DiffusionInpainter:
     """A backbone, personalised by `learn` from the training views or left generic."""
 
@@ -47,6 +50,23 @@ class DiffusionInpainter:
             person = Personaliser(self.backbone, views, self.config, self.seed, self.ledger)
             person.run(progress, adapt)
             self.prompt, self.curves = person.prompt, person.curves
+
+    @property
+    def paints_heads(self) -> bool:
+        """Whether hidden heads are to be painted once more; never without semantic guidance."""
+        return self.config.sg and (self.backbone.heads if self.config.heads is None else self.config.heads)
+
+    def inpaint_heads(self, heads: list[CropView], progress: Progress) -> list[NDArray[np.uint8]]:
+        """Head crops, each completed from what it begins with (`fill`). By the backbone as it was before it was
+        personalised, which is from crops of whole persons alone."""
+        if not heads:
+            return []
+        settled = self.config.settled()
+        return inpaint_views(
+            load_backbone(self.config, str(self.backbone.device)), heads, ANYBODY, progress,
+            seed=self.seed, steps=settled.sampler_steps, use_parts=True, noise_scale=settled.noise,
+            batch=HEADS_A_CROP * self.config.batch,
+        )  # fmt: skip
 
     def inpaint(self, views: list[CropView], progress: Progress) -> list[NDArray[np.uint8]]:
         settled = self.config.settled()

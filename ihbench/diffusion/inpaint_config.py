@@ -110,6 +110,11 @@ class InpaintConfig:
     turntable: Annotated[int, Within(0, 10_000)] = 0
     """Views of the stage-1 avatar, all around it, inpainted too: the only way to surface that never faced the camera.
     A departure from the paper; needs context "seen"."""
+    heads: bool | None = None
+    """Paint hidden heads once more, at twice the scale, beginning with what was painted of the person. None: where
+    the backbone has learned heads, as the mini that comes with the bench has, and sd2 has not. Never without `sg`."""
+    heads_trust: Annotated[float, Within(0, 1)] = 0.7
+    """As `trust`, of heads painted once more."""
     silhouette: Literal["coverage", "grabcut", "sam"] = "coverage"
     """What finds the complete silhouette in a painted frame: half of the way from the background's colour to the
     person's, GrabCut, or HQ-SAM (the paper's)."""
@@ -172,4 +177,4 @@ OWN = {
 LORA_OF_MINI = 1e-3  # step size: so few weights need longer steps
 
 QUICK_INPAINT = InpaintConfig()
-PAPER_INPAINT = InpaintConfig(ti_steps=1000, lora_steps=2000, trust=1.0, key_views=0)
+PAPER_INPAINT = InpaintConfig(ti_steps=1000, lora_steps=2000, trust=1.0, heads_trust=1.0, key_views=0)

@@ -40,7 +40,8 @@ def sample(
     """
     scheduler = backbone.scheduler
     scheduler.set_timesteps(steps, device=backbone.device)
-    condition = backbone.condition(batch.pixels.to(backbone.dtype), batch.unknown, batch.person)
+    fill = None if batch.fill is None else batch.fill.to(backbone.dtype)
+    condition = backbone.condition(batch.pixels.to(backbone.dtype), batch.unknown, batch.person, fill)
     prompts = [prompt] if guidance <= 1 else [prompt, negative]
     text = backbone.text(prompts)
     guide = batch.guide if use_parts else None
@@ -105,7 +106,8 @@ def inpaint_views(
     with progress.task("inpainting", len(todo)) as task:
         task.advance(len(done))
         for width, numbers in by_width(views).items():
-            noise = noise_scale * shared_noise(backbone, seed, width)
+            height = views[numbers[0]].crop.height
+            noise = noise_scale * shared_noise(backbone, seed, width, height)
             rest = [k for k in numbers if k in todo]
             while rest:
                 now, rest = rest[:batch], rest[batch:]
@@ -118,7 +120,7 @@ def inpaint_views(
                         control_scale=control_scale, guess=guess,
                     )  # fmt: skip
                 except (MemoryError, RuntimeError) as error:
-                    size = f"{width}×{backbone.size} px"
+                    size = f"{width}×{height} px"
                     line = f"inpainting: one crop of {size} does not fit into memory; {ADVICE[backbone.name]}"
                     batch, rest = halved(batch, error, line), now + rest
                     continue

@@ -34,6 +34,8 @@ class CropView:
     camera: Camera  # of the crop
     body_pose: BodyPose
     elsewhere: NDArray[np.uint8] | None = None  # [S, W, 4] RGB of surface that other frames show, and 255 there
+    fill: NDArray[np.uint8] | None = None  # [S, W, 3] what a painter begins with in unknown pixels
+    guide: NDArray[np.uint8] | None = None  # [S, W, 3] what guides it in the place of the part map's colours
 
     @property
     def body(self) -> NDArray[np.bool_]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -16,6 +17,8 @@ from ihbench.diffusion.quiet_libraries import quiet_libraries
 from ihbench.diffusion.text_encoder import unread_text_encoder
 from ihbench.errors import BadInput
 from ihbench.files import atomic
+
+HEADS = "heads"  # of the ControlNet's configuration: whether it knows the guide of head crops
 
 
 def save_mini(backbone: Backbone, folder: Path) -> None:
@@ -36,6 +39,9 @@ def _save(backbone: Backbone, folder: Path) -> None:
             part.to(kind).save_pretrained(folder / name, safe_serialization=True)
             part.to(torch.float32)
         part.load_state_dict(original)
+    if backbone.heads:
+        config = folder / "controlnet" / "config.json"
+        config.write_text(json.dumps(json.loads(config.read_text()) | {HEADS: True}, indent=2, sort_keys=True) + "\n")
     backbone.tokenizer.save_pretrained(folder / "tokenizer")
     backbone.scheduler.save_pretrained(folder / "scheduler")
 
@@ -44,6 +50,7 @@ def load_mini(folder: Path | None = None, device: str = "cpu") -> Backbone:
     """The shipped backbone, or one that `ihbench train-mini` wrote, frozen. Raises `BadInput` for another folder, and
     for weights that are damaged, missing, superfluous or not finite: none is made up."""
     root, configs = check_mini(SHIPPED if folder is None else folder)
+    heads = configs["controlnet"].pop(HEADS, False) is True  # the library would complain of a word of ours
     from diffusers import ControlNetModel, DDIMScheduler, UNet2DConditionModel
 
     from ihbench.diffusion.mini.block_transform import BlockTransform
@@ -74,6 +81,7 @@ def load_mini(folder: Path | None = None, device: str = "cpu") -> Backbone:
         size=SIZE,
         square=False,
         prefill=True,
+        heads=heads,
     )
 
 

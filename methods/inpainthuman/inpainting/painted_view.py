@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench.diffusion.crops.crop_view import CropView
+from ihbench.diffusion.crops.head_crop import PaintedHead
 from ihbench.scene.contracts import MaskState, TrainView
 
 
@@ -27,11 +28,14 @@ def paste_back(
     painted: NDArray[np.uint8],  # [S, W, 3] the completed crop
     silhouette: NDArray[np.bool_],  # [S, W] the complete silhouette in it
     original: TrainView | None,  # the training view; None for a turntable view, of which nothing else is believed
+    head: PaintedHead | None = None,  # its head, painted at a larger scale
 ) -> PaintedView:
     """Bring a painted crop to the view's resolution: the original where it is visible, the painted image where the
     painter was asked, and nothing in pixels of the original's occluder that another frame knows better."""
     crop = crop_view.crop
     image = crop.paste(painted.astype(np.float32), shown.image.astype(np.float32))
+    if head is not None:
+        image, _ = head.onto(image)
     image = np.clip(np.rint(image), 0, 255).astype(np.uint8)
     alpha = crop.paste(silhouette.astype(np.float32), (shown.mask == MaskState.PERSON).astype(np.float32))
     # outside the crop nothing was painted: what was asked there stays unknown

@@ -14,6 +14,7 @@ from ihbench.clock.ledger import Ledger
 from ihbench.clock.progress import Progress
 from ihbench.diffusion.crops.crop_view import CropView, Inpainter, cut_view, with_frames
 from ihbench.diffusion.crops.elsewhere import with_elsewhere
+from ihbench.diffusion.crops.head_crop import PaintedHead, head_views, with_head
 from ihbench.diffusion.inpaint_config import InpaintConfig
 from ihbench.methods.inpainthuman.avatar.avatar import GaussianAvatar
 from ihbench.methods.inpainthuman.inpainting.painted_view import PaintedView, paste_back
@@ -65,17 +66,23 @@ class Stage2:
             diffusion.learn(frames, progress)
         if not crops:
             return self._nothing("nothing needed painting; personalised as asked")
+        heads: dict[int, PaintedHead] = {}
         with self.ledger.stage("inpaint"):
             # the simple inpainters take their colours from whatever frame shows them
             given = crops if diffusion is not None else filmed
             painted = inpainter.inpaint(given, progress)[: len(crops)]
+            if diffusion is not None and diffusion.paints_heads:
+                heads = self._heads(diffusion, crops, shown, painted, progress)
             if self.config.context == "seen" and self.config.trust < 1:
-                painted = [self._with_own_guess(*each) for each in zip(crops, painted, strict=True)]
+                trust = self.config.trust
+                painted = [self._with_own_guess(*each, trust) for each in zip(crops, painted, strict=True)]
+            for k, head in heads.items():
+                painted[k] = with_head(crops[k], painted[k], head, shown[crops[k].index])
         with self.ledger.stage("silhouette"):
             silhouettes = [finder.complete(view, image) for view, image in zip(crops, painted, strict=True)]
         out = [
-            paste_back(shown[view.index], view, image, silhouette, self._original(view.index))
-            for view, image, silhouette in zip(crops, painted, silhouettes, strict=True)
+            paste_back(shown[view.index], view, image, silhouette, self._original(view.index), heads.get(k))
+            for k, (view, image, silhouette) in enumerate(zip(crops, painted, silhouettes, strict=True))
         ]
         if diffusion is not None:
             for state, curve in diffusion.curves.items():
@@ -127,10 +134,26 @@ class Stage2:
         device = str(self.avatar.device)
         return silhouette_finder(self.config.silhouette, self.training.background, self.config.sam_weights, device)
 
-    def _with_own_guess(self, view: CropView, painted: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def _heads(
+        self,
+        diffusion: DiffusionInpainter,
+        crops: list[CropView],
+        shown: dict[int, TrainView],
+        painted: list[NDArray[np.uint8]],
+        progress: Progress,
+    ) -> dict[int, PaintedHead]:
+        """Number of a crop -> its hidden head, painted once more."""
+        views = head_views(crops, shown, painted, self.training.body)
+        images = diffusion.inpaint_heads(list(views.values()), progress)
+        if self.config.context == "seen":
+            trust = self.config.heads_trust
+            images = [self._with_own_guess(*each, trust) for each in zip(views.values(), images, strict=True)]
+        return {k: PaintedHead(view, image) for (k, view), image in zip(views.items(), images, strict=True)}
+
+    def _with_own_guess(self, view: CropView, painted: NDArray[np.uint8], trust: float) -> NDArray[np.uint8]:
         """Painted pixels, averaged with what the avatar shows there: the two err differently."""
         guess, _ = self.avatar.render(view.camera, view.body_pose, self.training.background)
-        mixed = self.config.trust * painted + (1 - self.config.trust) * 255 * guess
+        mixed = trust * painted + (1 - trust) * 255 * guess
         return np.where(view.unknown[..., None], np.rint(mixed), painted).astype(np.uint8)
 
     def _original(self, index: int) -> TrainView | None:
