@@ -201,6 +201,28 @@ def test_of_a_dropped_context_little_is_left(tmp_path, dataset):
     assert not (seen & (whole.labels == NO_PART)).any()  # the surface is the body's
 
 
+def test_steps_with_heads_and_steps_with_persons(tmp_path, dataset):
+    """A share of the steps paints heads alone, from a blurred beginning; the features of a face weigh more."""
+    config = replace(SMALL, heads=1.0)
+    trainer = MiniTrainer(config, tmp_path / "heads", dataset, QUIET)
+    batch = trainer.batches[0]
+    assert batch.fills is not None
+    assert batch.guides is not None
+    assert batch.images.shape[1:3] == (SIDE // 2, 3 * SIDE // 8)
+    assert len(batch.images) == 4 * SMALL.batch
+    there = batch.person & batch.hidden
+    begun, truth = batch.fills[there].float(), batch.images[there].float()
+    assert 1 < (begun - truth).abs().mean() < 60
+    assert np.isfinite(trainer.loss(batch).item())
+    heavier = MiniTrainer(replace(config, feature_weight=50.0), tmp_path / "faces", dataset, QUIET)
+    assert heavier.loss(batch).item() != pytest.approx(trainer.loss(batch).item(), rel=1e-4)
+    persons = MiniTrainer(replace(SMALL, heads=0.0), tmp_path / "persons", dataset, QUIET).batches
+    assert all(persons[step].guides is None for step in range(4))
+    mixed = trainer.batches
+    mixed.config = replace(SMALL, heads=0.5)
+    assert {mixed[step].guides is None for step in range(12)} == {True, False}
+
+
 def test_a_backbone_that_knew_the_part_map_alone_can_be_trained_on(tmp_path, dataset, monkeypatch):
     """Its guide's new channels weigh nothing at first: it answers as before."""
     monkeypatch.setattr(mini_model, "GUIDE_CHANNELS", 3)
@@ -353,6 +375,8 @@ def test_the_command_trains_validates_and_writes_a_card(tmp_path, capsys, monkey
         "mean visible colour, silhouette given",
         "push-pull, silhouette given",
         "mini, 1 steps, noise 0, with parts",
+        "hidden face, as it begins",
+        "hidden face, mini, 6 steps, noise 0",
     } <= set(result["hidden_psnr"])
     assert all(np.isfinite(value) for value in result["hidden_psnr"].values())
     card = (tmp_path / "README.md").read_text()

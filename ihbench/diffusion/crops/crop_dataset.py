@@ -15,20 +15,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ihbench import registry
-from ihbench.body import load_body
+from ihbench.body import Body, load_body
 from ihbench.clock.interruption import end_with_parent
 from ihbench.clock.progress import Progress
 from ihbench.clock.threads import begin_on_one_thread
-from ihbench.diffusion.crops.part_map import drawn_body, labels_of
+from ihbench.diffusion.crops.head_crop import ROOM, WIDTH, head_crop, head_size
+from ihbench.diffusion.crops.head_places import head_guide
+from ihbench.diffusion.crops.part_map import NO_PART, drawn_body, labels_of
 from ihbench.diffusion.crops.person_crop import PADDING, person_crop
 from ihbench.diffusion.crops.seen_surface import NOWHERE, uv_cells
 from ihbench.errors import BadInput
 from ihbench.files.npz import read_npz, write_npz
 
-VERSION = 3  # of what is kept of a photograph
+VERSION = 4  # of what is kept of a photograph
 PAGE = 100  # people per file
 COLUMNS = ("widths", "images", "silhouettes", "parts", "cells", "person")  # one row a crop
+HEADS = ("head_there", "head_images", "head_silhouettes", "head_parts", "head_guides")  # and of its head
 JITTER = 0.03  # of the body's longer side, by which the padding varies
+ROOM_JITTER = 0.1  # by which a head crop's room varies
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,11 @@ class Page:
     parts: NDArray[np.uint8]  # [N, S, S] SMPL parts
     cells: NDArray[np.uint16]  # [N, S, S] of the UV chart
     person: NDArray[np.int64]  # [N]
+    head_there: NDArray[np.bool_]  # [N] whether there is a head crop
+    head_images: NDArray[np.uint8]  # [N, h, w, 3]
+    head_silhouettes: NDArray[np.bool_]  # [N, h, w]
+    head_parts: NDArray[np.uint8]  # [N, h, w]
+    head_guides: NDArray[np.uint8]  # [N, h, w, 3] of `head_guide`
     phrases: list[tuple[str, ...]]  # per person
     traits: NDArray[np.float32]  # [P, T] per person
 
@@ -48,7 +57,7 @@ class Page:
 def make_page(people: str, start: int, count: int, each: int, size: int) -> Page:
     """Draw `count` people from number `start`, and crop `each` photographs of every one."""
     draw_person, body = registry.load("people", people).draw_person, load_body()
-    columns: dict[str, list[Any]] = {name: [] for name in COLUMNS}
+    columns: dict[str, list[Any]] = {name: [] for name in (*COLUMNS, *HEADS)}
     phrases, traits = [], []
     for k in range(count):
         person = draw_person(start + k, body, each)
@@ -67,8 +76,24 @@ def make_page(people: str, start: int, count: int, each: int, size: int) -> Page
             columns["parts"].append(np.pad(labels_of(raster, body), padded))
             columns["cells"].append(np.pad(uv_cells(raster, body), padded, constant_values=NOWHERE))
             columns["person"].append(k)
+            room = ROOM * (1 + ROOM_JITTER * rng.uniform(-1, 1))
+            for name, value in _head(shot, vertices, body, head_size(size), room).items():
+                columns[name].append(value)
     arrays = {name: np.array(values) for name, values in columns.items()}
     return Page(**arrays, phrases=phrases, traits=np.array(traits, np.float32))
+
+
+def _head(shot: Any, vertices: NDArray[np.float64], body: Body, size: int, room: float) -> dict[str, Any]:
+    """The row of `HEADS` of a photograph; of a head behind the camera an empty one."""
+    crop = head_crop(shot.camera, vertices, body, size, room)
+    if crop is None:
+        shape = (size, round(WIDTH * size))
+        empty = np.zeros(shape, np.uint8), np.zeros((*shape, 3), np.uint8)
+        return dict(zip(HEADS, (False, empty[1], empty[0] > 0, empty[0] + NO_PART, empty[1]), strict=True))
+    raster = drawn_body(vertices, body, crop.camera(shot.camera))
+    image, silhouette = crop.cut(shot.image, 255), crop.cut(shot.silhouette) > 0.5
+    row = True, image, silhouette, labels_of(raster, body), head_guide(raster, body)
+    return dict(zip(HEADS, row, strict=True))
 
 
 class CropDataset:
@@ -115,7 +140,7 @@ def _write_page(work: tuple[str, int, int, int, int, Path]) -> None:
     people, start, count, each, size, path = work
     page = make_page(people, start, count, each, size)
     words = np.array(["\n".join(phrases) for phrases in page.phrases])
-    arrays = {name: getattr(page, name) for name in (*COLUMNS, "traits")}
+    arrays = {name: getattr(page, name) for name in (*COLUMNS, *HEADS, "traits")}
     write_npz(path, {"phrases": words, **arrays})
 
 

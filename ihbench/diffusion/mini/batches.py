@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
@@ -26,6 +27,11 @@ STRIPS = (0.7, 0.15, 0.15, 0.0, 0.0, 0.0)  # kinds of occluders of the other pho
 NOISY = 0.6  # share of the schedule, above which a dropped context is noised
 LEFT = 0.15  # of the crop's sides, that a dropped context leaves at most
 NOT_IN_HIDDEN = 0.35  # share of the crops whose hidden surface no other photograph shows
+HEADS_A_CROP = 4  # head crops in the pixels of a person crop
+WHOLE_HEAD = 0.5  # share of the head crops in which everything is hidden
+HEAD_SHARES = (0.25, 0.25, 0.15, 0.25, 0.10, 0.0)  # kinds of occluders of the others
+BLUR = (0.035, 0.2)  # of a head crop's height, sigma of what a painting begins with
+TINT = 0.04  # standard deviation of its colours' shift
 
 
 class Crops:
@@ -36,6 +42,11 @@ class Crops:
         self.pages = pages
         self.phrases = [phrases for page in pages for phrases in page.phrases]
         self.traits = np.concatenate([page.traits for page in pages])
+        rows = []
+        for k, page in enumerate(pages):
+            there = np.flatnonzero(page.head_there)
+            rows.append(np.column_stack([np.full(len(there), k), there, starts[k] + page.person[there]]))
+        self.heads = np.concatenate(rows)  # [n, 3] page, crop, person of every head crop
         self.of_person = [[np.flatnonzero(page.person == k) for k in range(len(page.phrases))] for page in pages]
         self.by_width: dict[int, NDArray[np.int64]] = {}  # [n, 3] page, crop, person
         for width in np.unique(np.concatenate([page.widths for page in pages])):
@@ -54,6 +65,21 @@ class Crops:
         rows = self.by_width[width]
         size = max(round(batch * USUAL_WIDTH * SIZE / width), 1)
         return width, rows[rng.choice(len(rows), size, replace=len(rows) < size)]
+
+    def draw_heads(self, rng: np.random.Generator, batch: int) -> NDArray[np.int64]:
+        """[n, 3] as many head crops as have the pixels of `batch` crops of the usual width."""
+        size = max(HEADS_A_CROP * batch, 1)
+        return self.heads[rng.choice(len(self.heads), size, replace=len(self.heads) < size)]
+
+    def head_images(self, rows: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """Images [B, h, w, 3], silhouettes [B, h, w], part labels [B, h, w] and guides [B, h, w, 3] of heads."""
+        picked = [(self.pages[page], crop) for page, crop, _ in rows]
+        return (
+            np.stack([page.head_images[crop] for page, crop in picked]),
+            np.stack([page.head_silhouettes[crop] for page, crop in picked]),
+            np.stack([page.head_parts[crop] for page, crop in picked]),
+            np.stack([page.head_guides[crop] for page, crop in picked]),
+        )
 
     def images(self, width: int, rows: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray]:
         """Images [B, S, W, 3], silhouettes [B, S, W] and part labels [B, S, W]."""
@@ -81,6 +107,8 @@ class MiniBatch:
     ids: Tensor  # [B, L] the prompts
     noise_seed: int
     use_parts: bool
+    fills: Tensor | None = None  # [B, S, W, 3] uint8 what painting heads begins with
+    guides: Tensor | None = None  # [B, S, W, 3] uint8 what guides it in the place of the part map
 
     def to(self, device: torch.device) -> MiniBatch:
         return self._each(lambda tensor: tensor.to(device, non_blocking=True))
@@ -102,8 +130,12 @@ class Batches(Dataset[MiniBatch]):
         self.tokenizer, self.max_tokens = tokenizer, max_tokens
 
     def __getitem__(self, step: int) -> MiniBatch:
+        rng = np.random.default_rng((self.config.seed, step))
+        return self.heads(rng) if rng.random() < self.config.heads else self.persons(rng)
+
+    def persons(self, rng: np.random.Generator) -> MiniBatch:
+        """A step's crops of whole persons."""
         config = self.config
-        rng = np.random.default_rng((config.seed, step))
         width, rows = self.crops.draw(rng, config.batch)
         images, person, labels = self.crops.images(width, rows)
         dropped = rng.random(len(rows)) < config.context_dropped
@@ -123,6 +155,27 @@ class Batches(Dataset[MiniBatch]):
             ids=padded_ids(self.tokenizer, prompts, self.max_tokens),
             noise_seed=int(rng.integers(2**62)),
             use_parts=use_parts,
+        )
+
+    def heads(self, rng: np.random.Generator) -> MiniBatch:
+        """A step's crops of heads: all of each hidden or part of it, painting begins with a blurred one."""
+        rows = self.crops.draw_heads(rng, self.config.batch)
+        images, person, labels, guides = self.crops.head_images(rows)
+        hidden = np.stack([hidden_head(rng, mask) for mask in person])
+        fills = np.stack([begun_head(rng, image, mask) for image, mask in zip(images, person, strict=True)])
+        prompts, captioned = self.words(rng, rows[:, 2])
+        seen = np.zeros((*labels.shape, 4), np.uint8)
+        return MiniBatch(
+            *(torch.from_numpy(array) for array in (images, seen, person, hidden, labels)),
+            timesteps=torch.from_numpy(rng.integers(0, self.timesteps, len(rows))),
+            traits=torch.from_numpy(self.crops.traits[rows[:, 2]]),
+            people=torch.from_numpy(rows[:, 2]),
+            told=torch.tensor(captioned),
+            ids=padded_ids(self.tokenizer, prompts, self.max_tokens),
+            noise_seed=int(rng.integers(2**62)),
+            use_parts=True,
+            fills=torch.from_numpy(fills),
+            guides=torch.from_numpy(guides),
         )
 
     def seen(
@@ -174,6 +227,29 @@ class Batches(Dataset[MiniBatch]):
                 prefetch_factor=4 if workers else None,
             )
         )
+
+
+def hidden_head(rng: np.random.Generator, person: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """[H, W] an occluder before a head crop: mostly all of it."""
+    if rng.random() < WHOLE_HEAD:
+        return np.ones(person.shape, bool)
+    return random_mask(rng, person, HEAD_SHARES)
+
+
+def begun_head(
+    rng: np.random.Generator, image: NDArray[np.uint8], person: NDArray[np.bool_], sigma: float | None = None
+) -> NDArray[np.uint8]:
+    """[H, W, 3] a head as the painter of whole persons leaves it: soft, and not quite in its colours. `sigma` px is
+    drawn where none is given."""
+    given, tint = sigma is not None, rng.normal(0, 255 * TINT, 3)
+    low, high = np.log(BLUR)
+    sigma = float(np.exp(rng.uniform(low, high)) * len(image)) if sigma is None else sigma
+    inside = person.astype(np.float32)
+    weight = gaussian_filter(inside, sigma)
+    soft = gaussian_filter(image.astype(np.float32) * inside[..., None], (sigma, sigma, 0))
+    soft = soft / np.maximum(weight, 1e-3)[..., None] + (0 if given else tint)
+    edge = gaussian_filter(inside, 1.0)[..., None]
+    return np.clip(np.rint(edge * soft + (1 - edge) * 255), 0, 255).astype(np.uint8)
 
 
 def nearly_all(rng: np.random.Generator, person: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -20,7 +20,8 @@ from ihbench import registry
 from ihbench.clock.progress import Progress
 from ihbench.diffusion.backbone import Backbone, shrink_mask
 from ihbench.diffusion.crops.crop_dataset import PAGE, CropDataset
-from ihbench.diffusion.crops.diffusion_batch import guide_of
+from ihbench.diffusion.crops.diffusion_batch import guide_of, signed
+from ihbench.diffusion.crops.head_places import marked
 from ihbench.diffusion.crops.part_map import HEAD, N_PARTS, NO_PART, part_colours
 from ihbench.diffusion.mini.batches import TRAIT_TOKENS, Batches, Crops, MiniBatch
 from ihbench.diffusion.mini.model import GUIDE_CHANNELS, SIZE, TEXT_WIDTH, new_mini
@@ -33,6 +34,7 @@ STATE = "training.safetensors"
 CURVE = "curve.jsonl"
 TRAINED = ("unet", "controlnet", "text_encoder")
 RISE = 200  # steps of warming up
+HEAD_STEPS = 6.0  # times the loss of head crops: a gradient as long as persons', or Adam would hardly hear it
 GUIDE = "controlnet_cond_embedding.conv_in.weight"
 
 
@@ -83,6 +85,7 @@ class MiniTrainer:
         self.backbone = new_mini(people.vocabulary(), config.seed)
         if start is not None:
             self._begin_from(load_mini(start))
+        self.backbone.heads |= config.heads > 0
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed + 1)
             self.tokens = PersonTokens(people.N_TRAITS, config.people)
@@ -116,6 +119,7 @@ class MiniTrainer:
         """Take an earlier backbone's weights. Raises `BadInput` when it has another shape or other words."""
         if earlier.tokenizer.get_vocab() != self.backbone.tokenizer.get_vocab():
             raise BadInput("--start: a backbone that knows other words than these people's captions have")
+        self.backbone.heads = earlier.heads
         for name in (*TRAINED, "codec"):
             state = getattr(earlier, name).state_dict()
             if name == "controlnet":
@@ -127,7 +131,7 @@ class MiniTrainer:
 
     def _standardise(self, crops: Crops) -> None:
         page = crops.pages[0]
-        images = torch.from_numpy(page.images).to(self.device).movedim(-1, 1).float() / 127.5 - 1
+        images = signed(torch.from_numpy(page.images).to(self.device))
         person = torch.from_numpy(page.silhouettes).to(self.device)
         self.backbone.codec.standardise(images, person[:, None])
         self._weigh_channels()
@@ -136,6 +140,7 @@ class MiniTrainer:
         scale = self.backbone.codec.scale
         weight = scale**1.5  # between the pixels' own (2) and equal weight for every frequency (0)
         self.channel_weight = (weight / weight.mean())[:, None, None]
+        self.detail_weight = (scale / scale.mean())[:, None, None]  # of heads, whose details make a face
 
     # --- one step ---
 
@@ -184,10 +189,11 @@ class MiniTrainer:
         return value
 
     def loss(self, batch: MiniBatch) -> Tensor:
-        """Weighted error of the clean latents over hidden blocks. SNR weights are clipped to [1, 5]."""
+        """Weighted error of the clean latents over hidden blocks. SNR weights are clipped to [1, 5]; heads have none,
+        since their sampling begins with nearly all that it will say."""
         backbone, device = self.backbone, self.device
         batch = batch.to(device)
-        pixels = batch.images.movedim(-1, 1).float() / 127.5 - 1
+        pixels = signed(batch.images)
         person, hidden = (mask[:, None].float() for mask in (batch.person, batch.hidden))
         timesteps = batch.timesteps
         latents = backbone.codec.encode(pixels)
@@ -197,16 +203,22 @@ class MiniTrainer:
         guide = None
         if batch.use_parts:
             seen = batch.seen.movedim(-1, 1).float() / 255
-            guide = guide_of(self.colours[batch.labels.long()].movedim(-1, 1), seen)
-        condition = backbone.condition(pixels, hidden, person)
+            parts = self.colours[batch.labels.long()] if batch.guides is None else batch.guides.float() / 255
+            guide = guide_of(parts.movedim(-1, 1), seen)
+        condition = backbone.condition(pixels, hidden, person, None if batch.fills is None else signed(batch.fills))
         with torch.autocast(device.type, torch.bfloat16, enabled=self.config.precision == "bfloat16"):
             predicted = backbone.predict(noisy, timesteps, condition, self._text(batch), guide).float()
         body = shrink_mask(person, latents)
         weight = shrink_mask(hidden, latents)
         weight = weight * (self.config.background_weight + (1 - self.config.background_weight) * body)
-        head = shrink_mask((batch.labels % N_PARTS == HEAD)[:, None] & (batch.labels != NO_PART)[:, None], latents)
-        weight = weight * (1 + (self.config.head_weight - 1) * head)
-        error = ((predicted - backbone.target(latents, noise, timesteps)).square() * self.channel_weight).mean(1)
+        squared = (predicted - backbone.target(latents, noise, timesteps)).square()
+        head = ((batch.labels % N_PARTS == HEAD) & (batch.labels != NO_PART))[:, None]
+        if batch.guides is not None:
+            weight = weight * _raised(self.config.feature_weight, head & marked(batch.guides)[:, None], latents)
+            error = (squared * self.detail_weight).mean(1)
+            return HEAD_STEPS * (error * weight[:, 0]).sum() / weight.sum().clamp(min=1)
+        weight = weight * _raised(self.config.head_weight, head, latents)
+        error = (squared * self.channel_weight).mean(1)
         per_sample = (error * weight[:, 0]).sum((1, 2)) / weight.sum((1, 2, 3)).clamp(min=1)
         return (per_sample * backbone.snr(timesteps).clamp(1, 5)).mean()
 
@@ -279,6 +291,11 @@ class MiniTrainer:
     def _note(self, row: dict[str, float]) -> None:
         path = self.folder / CURVE
         atomic.write_json_lines(path, [*(atomic.read_json_lines(path) if path.is_file() else ()), row])
+
+
+def _raised(times: float, where: Tensor, latents: Tensor) -> Tensor:
+    """[B, 1, h, w] `times` in blocks that a mask [B, 1, H, W] marks, else 1."""
+    return 1 + (times - 1) * shrink_mask(where, latents)
 
 
 def _widened(weight: Tensor, channels: int) -> Tensor:

@@ -41,6 +41,10 @@ class MiniTraining:
     """Weight of hidden blocks without the person."""
     head_weight: Annotated[float, Within(0, 1000)] = 3.0
     """Weight of hidden blocks that show the head, which is small and of which most is known least."""
+    heads: Annotated[float, Within(0, 1)] = 0.5
+    """Share of the steps with heads alone at twice the scale: four times as many crops, each a quarter as large."""
+    feature_weight: Annotated[float, Within(0, 1000)] = 5.0
+    """Weight, in a head crop, of blocks that show eyes, brows, nose or mouth."""
     context_dropped: Annotated[float, Within(0, 1)] = 0.25
     """Share of the crops of which all but a small piece is hidden: who it is can come from the words alone."""
     seen: Annotated[float, Within(0, 1)] = 0.8

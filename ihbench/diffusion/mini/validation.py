@@ -14,10 +14,12 @@ from ihbench import registry
 from ihbench.clock.progress import Progress
 from ihbench.diffusion.backbone import Backbone
 from ihbench.diffusion.crops.crop_dataset import PAGE, CropDataset, Page
-from ihbench.diffusion.crops.diffusion_batch import DiffusionBatch, shared_noise
+from ihbench.diffusion.crops.diffusion_batch import DiffusionBatch, shared_noise, signed
+from ihbench.diffusion.crops.head_places import head_of, marked
 from ihbench.diffusion.crops.part_map import part_colours
 from ihbench.diffusion.crops.push_pull import push_pull
 from ihbench.diffusion.crops.seen_surface import SurfaceColours
+from ihbench.diffusion.mini.batches import begun_head
 from ihbench.diffusion.sampling import sample
 from ihbench.diffusion.subject_token import ANYBODY
 
@@ -26,6 +28,7 @@ NOISES = (0.0, 1.0)
 GUIDES = {"without parts": "nothing", "with parts": "parts", "with parts and other photographs": "all"}
 STRIP = 0.5  # share of the person that the central strip hides
 PEOPLE = 48
+FACE_BLUR = 0.08  # of a head crop's height
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,7 @@ def validate(backbone: Backbone, dataset: Path, each: int, progress: Progress) -
             colours = part_colours(page.parts[rows, :, :width])
             seen = np.stack([_seen_by_others(page, row, int(width)) for row in rows])
             batch = DiffusionBatch(
-                pixels=torch.from_numpy(images).to(device).movedim(-1, 1).float() / 127.5 - 1,
+                pixels=signed(torch.from_numpy(images).to(device)),
                 unknown=torch.from_numpy(hidden).to(device)[:, None].float(),
                 person=torch.from_numpy(person & ~hidden).to(device)[:, None].float(),
                 parts=torch.from_numpy(colours).to(device).movedim(-1, 1).float() / 255,
@@ -74,8 +77,43 @@ def validate(backbone: Backbone, dataset: Path, each: int, progress: Progress) -
                 error = ((painted - batch.pixels) / 2).square().mean(1)[where]
                 errors.setdefault(name, []).append(error.double().cpu().numpy())
             task.advance(len(rows))
+    errors |= _hidden_faces(backbone, page, progress)
     psnr = {name: float(-10 * np.log10(np.concatenate(parts).mean())) for name, parts in errors.items()}
     return Validation(PEOPLE, STRIP, psnr)
+
+
+def _hidden_faces(backbone: Backbone, page: Page, progress: Progress) -> dict[str, list[NDArray[np.float64]]]:
+    """Squared errors of heads of which everything is hidden and the model begins with a blurred one: every held-out
+    person's first that shows a face."""
+    faces = page.head_there & (marked(page.head_guides) & head_of(page.head_parts)).any((1, 2))
+    first = [np.flatnonzero(faces & (page.person == k))[:1] for k in range(PEOPLE)]
+    rows = np.concatenate(first)
+    if not len(rows):
+        return {}
+    device = backbone.device
+    images, person, guides = page.head_images[rows], page.head_silhouettes[rows], page.head_guides[rows]
+    height, width = images.shape[1:3]
+    rng = np.random.default_rng(0)
+    begun = np.stack([begun_head(rng, *each, FACE_BLUR * height) for each in zip(images, person, strict=True)])
+    there = torch.from_numpy(person).to(device)[:, None].float()
+    batch = DiffusionBatch(
+        pixels=signed(torch.from_numpy(images).to(device)),
+        unknown=torch.ones_like(there),
+        person=torch.zeros_like(there),
+        parts=torch.from_numpy(guides).to(device).movedim(-1, 1).float() / 255,
+        seen=torch.zeros(len(rows), 4, height, width, device=device),
+        fill=signed(torch.from_numpy(begun).to(device)),
+    )
+    field = shared_noise(backbone, 0, width, height)
+    made = {"hidden face, as it begins": batch.fill}
+    with progress.task("validating faces", 1):
+        made["hidden face, mini, 6 steps, noise 0"] = sample(
+            backbone, batch, 0 * field, ANYBODY, steps=6, use_parts=True
+        )
+    return {
+        name: [((painted - batch.pixels) / 2).square().mean(1)[there[:, 0] > 0].double().cpu().numpy()]
+        for name, painted in made.items()
+    }
 
 
 def _seen_by_others(page: Page, crop: int, width: int) -> NDArray[np.uint8]:
