@@ -34,6 +34,7 @@ def test_every_row_is_scored_in_every_scene(painted):
         assert all(4 < rows[name]["psnr"] < 60 for name in list(rows)[:4])
         bounds = [rows[name].keys() for name in (TRUTH, SEEN)]
         assert bounds == 2 * [{"delta_e", "flicker"}]
+        assert all(4 < rows[name]["face"] < 60 for name in list(rows)[:4])
         # most of the hidden surface is shown by another frame
         assert rows["temporal"]["psnr_on_body"] > rows["mean"]["psnr_on_body"] + 1
         assert rows["generic+sg"]["psnr"] != rows[FULL]["psnr"]
