@@ -94,7 +94,8 @@ def _hidden_faces(backbone: Backbone, page: Page, progress: Progress) -> dict[st
     images, person, guides = page.head_images[rows], page.head_silhouettes[rows], page.head_guides[rows]
     height, width = images.shape[1:3]
     rng = np.random.default_rng(0)
-    begun = np.stack([begun_head(rng, *each, FACE_BLUR * height) for each in zip(images, person, strict=True)])
+    soft = np.stack([begun_head(rng, *each, FACE_BLUR * height) for each in zip(images, person, strict=True)])
+    begun = signed(torch.from_numpy(soft).to(device))
     there = torch.from_numpy(person).to(device)[:, None].float()
     batch = DiffusionBatch(
         pixels=signed(torch.from_numpy(images).to(device)),
@@ -102,10 +103,10 @@ def _hidden_faces(backbone: Backbone, page: Page, progress: Progress) -> dict[st
         person=torch.zeros_like(there),
         parts=torch.from_numpy(guides).to(device).movedim(-1, 1).float() / 255,
         seen=torch.zeros(len(rows), 4, height, width, device=device),
-        fill=signed(torch.from_numpy(begun).to(device)),
+        fill=begun,
     )
     field = shared_noise(backbone, 0, width, height)
-    made = {"hidden face, as it begins": batch.fill}
+    made = {"hidden face, as it begins": begun}
     with progress.task("validating faces", 1):
         made["hidden face, mini, 6 steps, noise 0"] = sample(
             backbone, batch, 0 * field, ANYBODY, steps=6, use_parts=True
