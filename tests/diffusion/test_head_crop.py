@@ -132,6 +132,19 @@ class TestViews:
         assert not (region & ~self.head.unknown).any()
         assert not region[-6:].any()
 
+    def test_leave_what_is_seen_of_a_head_alone(self):
+        columns = np.nonzero((a_view().mask == MaskState.PERSON).any(0))[0]
+        hidden = np.zeros((SIZE, SIZE), bool)
+        hidden[:, : int(columns.mean())] = True
+        view = a_view(FRONT, hidden)
+        crop = cut_view(view, 0, the_body(), 128)
+        (half,) = head_views([crop], {0: view}, [crop.image], the_body()).values()
+        head = head_of(half.parts)
+        assert (head & ~half.unknown).sum() > 100
+        region = head_region(half)
+        assert region.any()
+        assert not (region & ~half.unknown).any()
+
     def test_come_back_into_the_person_crop(self):
         head = PaintedHead(self.head, self.head.completed(np.tile(RED, (64, 48, 1))))
         done = with_head(self.crop, self.painted, head, self.view)
@@ -171,6 +184,14 @@ class TestPainting:
         asked = a[0, 0] > 0
         assert not (differs & ~asked).any()
         assert batch_of([head, replace(head, fill=None)], torch.device("cpu")).fill is None
+
+    def test_follows_what_it_begins_with(self, monkeypatch):
+        monkeypatch.setattr(diffusion_inpainter, "load_backbone", lambda config, device: tiny_backbone())
+        (head,) = self.heads()
+        painter = DiffusionInpainter(tiny_backbone(), InpaintConfig(sampler_steps=2), 0, Ledger())
+        begun = [head, replace(head, fill=255 - head.fill)]
+        first, second = painter.inpaint_heads(begun, Progress.silent())
+        assert (first[head.unknown] != second[head.unknown]).any()
 
     def test_noise_of_a_lower_crop_is_the_persons_first_rows(self):
         backbone = tiny_backbone()

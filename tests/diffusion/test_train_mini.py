@@ -218,6 +218,8 @@ def test_steps_with_heads_and_steps_with_persons(tmp_path, dataset):
     assert heavier.loss(batch).item() != pytest.approx(trainer.loss(batch).item(), rel=1e-4)
     persons = MiniTrainer(replace(SMALL, heads=0.0), tmp_path / "persons", dataset, QUIET).batches
     assert all(persons[step].guides is None for step in range(4))
+    assert trainer.backbone.heads
+    assert not MiniTrainer(replace(SMALL, heads=0.0), tmp_path / "none", dataset, QUIET).backbone.heads
     mixed = trainer.batches
     mixed.config = replace(SMALL, heads=0.5)
     assert {mixed[step].guides is None for step in range(12)} == {True, False}
