@@ -110,9 +110,10 @@ class InpaintConfig:
     turntable: Annotated[int, Within(0, 10_000)] = 0
     """Views of the stage-1 avatar, all around it, inpainted too: the only way to surface that never faced the camera.
     A departure from the paper; needs context "seen"."""
-    heads: bool | None = None
-    """Paint hidden heads once more, at twice the scale, beginning with what was painted of the person. None: where
-    the backbone has learned heads, as the mini that comes with the bench has, and sd2 has not. Never without `sg`."""
+    heads: bool | None = False
+    """Paint hidden heads once more, at twice the scale, beginning with what was painted of the person. None, as in
+    `ihbench paint`: where the backbone has learned heads, as the mini that comes with the bench has, and sd2 has not.
+    Off in runs: painters gain a face, avatars lose the outline of their hair. Never without `sg`."""
     heads_trust: Annotated[float, Within(0, 1)] = 0.7
     """As `trust`, of heads painted once more."""
     silhouette: Literal["coverage", "grabcut", "sam"] = "coverage"

@@ -44,7 +44,7 @@ class PaintOptions(ProtocolChanges, Report):
     """SMPL model file for real data (or IHBENCH_BODY)."""
     out: Path | None = None
     """Folder for `paint.json`, the table and a picture per scene."""
-    inpaint: InpaintConfig = field(default_factory=InpaintConfig)
+    inpaint: InpaintConfig = field(default_factory=lambda: InpaintConfig(heads=None))
     """How diffusion is personalised and sampled."""
 
 
