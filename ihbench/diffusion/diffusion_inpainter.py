@@ -10,6 +10,7 @@ from ihbench.clock.progress import Progress
 from ihbench.diffusion.backbone import Backbone
 from ihbench.diffusion.backbone_choice import load_chosen, look_at_chosen
 from ihbench.diffusion.crops.crop_view import CropView
+from ihbench.diffusion.crops.head_crop import A_PERSON_CROP
 from ihbench.diffusion.inpaint_config import InpaintConfig
 from ihbench.diffusion.personalise import Personaliser
 from ihbench.diffusion.sampling import inpaint_views
@@ -28,9 +29,6 @@ def check_backbone(config: InpaintConfig) -> None:
     tokenizer = look_at_chosen(config)
     if config.ti:
         new_words(tokenizer, config.token, config.settled().vectors, config.backbone)
-
-
-HEADS_A_CROP = 4  # head crops in the pixels of a person crop
 
 
 class DiffusionInpainter:
@@ -65,7 +63,7 @@ class DiffusionInpainter:
         return inpaint_views(
             load_backbone(self.config, str(self.backbone.device)), heads, ANYBODY, progress,
             seed=self.seed, steps=settled.sampler_steps, use_parts=True, noise_scale=settled.noise,
-            batch=HEADS_A_CROP * self.config.batch,
+            batch=A_PERSON_CROP * self.config.batch,
         )  # fmt: skip
 
     def inpaint(self, views: list[CropView], progress: Progress) -> list[NDArray[np.uint8]]:

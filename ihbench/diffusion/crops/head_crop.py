@@ -21,6 +21,7 @@ from ihbench.diffusion.crops.part_map import drawn_body
 from ihbench.diffusion.crops.person_crop import PersonCrop
 from ihbench.scene.contracts import TrainView
 
+A_PERSON_CROP = 4  # so many head crops have the pixels of a person crop
 WIDTH = 0.75  # of the crop, as a share of its height
 ROOM = 1.7  # height of the crop over the longer side of the head's box: hair stands off
 AROUND = 5  # px of a crop 64 px tall about the body model's head that are taken from its painting: hair again

@@ -15,6 +15,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from ihbench.diffusion.backbone import padded_ids
 from ihbench.diffusion.crops.crop_dataset import Page
+from ihbench.diffusion.crops.head_crop import A_PERSON_CROP
 from ihbench.diffusion.crops.random_mask import random_mask
 from ihbench.diffusion.crops.seen_surface import SurfaceColours
 from ihbench.diffusion.mini.model import SIZE
@@ -27,7 +28,6 @@ STRIPS = (0.7, 0.15, 0.15, 0.0, 0.0, 0.0)  # kinds of occluders of the other pho
 NOISY = 0.6  # share of the schedule, above which a dropped context is noised
 LEFT = 0.15  # of the crop's sides, that a dropped context leaves at most
 NOT_IN_HIDDEN = 0.35  # share of the crops whose hidden surface no other photograph shows
-HEADS_A_CROP = 4  # head crops in the pixels of a person crop
 WHOLE_HEAD = 0.5  # share of the head crops in which everything is hidden
 HEAD_SHARES = (0.25, 0.25, 0.15, 0.25, 0.10, 0.0)  # kinds of occluders of the others
 BLUR = (0.035, 0.2)  # of a head crop's height, sigma of what a painting begins with
@@ -68,7 +68,7 @@ class Crops:
 
     def draw_heads(self, rng: np.random.Generator, batch: int) -> NDArray[np.int64]:
         """[n, 3] as many head crops as have the pixels of `batch` crops of the usual width."""
-        size = max(HEADS_A_CROP * batch, 1)
+        size = max(A_PERSON_CROP * batch, 1)
         return self.heads[rng.choice(len(self.heads), size, replace=len(self.heads) < size)]
 
     def head_images(self, rows: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray, NDArray]:
